@@ -51,7 +51,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_report_header() -> str:
-    """Print the floating-point environment in the header, to diagnose machine-specific failures."""
+    """Show the floating-point environment in pytest's header, to help diagnose failures."""
     return f"arithmetic: {arithmetic.described()}"
 
 
@@ -72,9 +72,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip an extended test unless ``-m`` is given or the command line names the test's file.
+    """Skip each extended test unless ``-m`` or the test's file is given on the command line.
 
-    Tests that mostly wait start first, and other tests run while they wait.
+    Start the tests that mostly wait first, so that other tests run during the waits.
     """
     if not config.option.markexpr:
         named = {Path(each.partition("::")[0]).resolve() for each in config.args}
@@ -87,7 +87,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Make garbage collection skip the million objects of imported modules."""
+    """Exclude the million objects of imported modules from garbage collection."""
     if session.config.stash.get(PERTURBATION, None) is not None:
         session.config.stash[PERTURBATION].enter_modules()
     gc.collect()
@@ -138,7 +138,7 @@ def addresses() -> tuple[str, str]:
 def write_profile(path: Path, addresses: tuple[str, str], text: str = "") -> Path:
     """Write a profile that contains ``addresses`` and ``text``.
 
-    The default loop rate is 100 Hz, because the daemons of several tests share the processors.
+    The default loop rate is only 100 Hz, because tests run several daemons in parallel.
     """
     stream, commands = addresses
     rate = "" if "loop.rate" in text else "loop.rate = 100.0\n"
@@ -184,7 +184,7 @@ Start = Callable[..., Running]
 def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Inline:
     """Return a function that runs a subcommand in the test process."""
     monkeypatch.setattr(os, "nice", lambda _: 0)  # Keep the priority of the test process.
-    # Suppress messages about kernel compilation, which only the first test on a machine prints.
+    # Suppress the compilation messages that appear only in the first test on a machine.
     monkeypatch.setattr(kernels, "print_event", lambda *_: None)
 
     def run(*words: object) -> Told:
@@ -199,7 +199,7 @@ def inline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
 
 
 def until(condition: Callable[[], object], seconds: float = 150.0) -> None:
-    """Poll ``condition`` until it is true; raise TimeoutError if this takes too long."""
+    """Poll ``condition`` until it is true; raise TimeoutError after ``seconds``."""
     begin = time.monotonic()
     while not condition():
         waited = time.monotonic() - begin
@@ -229,7 +229,7 @@ def make() -> Iterator[Make]:
 
 @pytest.fixture
 def exact_solid_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set the errors of the solid-tip data to zero; the tests simulate frames from these data."""
+    """Set the errors of the solid-tip data to zero, because tests simulate frames from the data."""
     from softfinger.kinematics.estimation import error_budget, estimator
 
     data = estimator.solid_data

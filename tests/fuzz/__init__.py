@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 
 class Report(NamedTuple):
-    """Result of a run: number of inputs processed, and the errors found."""
+    """Result of a fuzz run: the number of processed inputs, and the errors found."""
 
     through: int
     wrong: list[str]

@@ -63,7 +63,7 @@ def some_message(rng: random.Random) -> bytes:
         return rng.randbytes(rng.randrange(0, 200))
     if kind < 0.12:
         return rng.randbytes(rng.choice((_MAX_BYTES - 1, _MAX_BYTES + 1, 4 * _MAX_BYTES + 1)))
-    if kind < 0.15:  # The value is deeply nested, or its header states more bytes than follow.
+    if kind < 0.15:  # Return a deeply nested or truncated value.
         deep = rng.choice((b"\x91" * 3000, b"\x81\xa1a" * 1000, b"\xdf\xff\xff\xff\xff"))
         return deep + rng.randbytes(rng.randrange(8))
     try:
@@ -76,8 +76,8 @@ def some_message(rng: random.Random) -> bytes:
 class CommandTarget:
     """Hand in virtual time; messages are passed to the hand directly or through a socket.
 
-    After every message, the loop must still run and the goals must be within the limits. In modes
-    without torque, torque must be off.
+    After every message, the loop must still run and the goals must be within the limits. In the
+    disarmed and fault modes, torque must be off.
     """
 
     def __init__(self) -> None:
@@ -152,7 +152,7 @@ class CommandTarget:
 
 
 class FileTarget:
-    """File reader under test, which must return the content or raise its documented exception."""
+    """File reader under test; it must return the content or raise the documented exception."""
 
     def __init__(
         self, read: Callable[[Path], Any], error: type[Exception], seeds: list[bytes], end: str

@@ -155,7 +155,7 @@ def abuse(seed: int, count: int = EACH) -> str:
 
 
 def fuzz(count: int, seed: int) -> Report:
-    """Send ``count`` commands in total, with a new hand after every EACH commands."""
+    """Send ``count`` commands in total, and create a new hand for every EACH commands."""
     hands = max(count // EACH, 1)
     found = [abuse(each) for each in range(1000 * seed, 1000 * seed + hands)]
     return Report(hands, [each for each in found if each])

@@ -51,10 +51,10 @@ def fuzz(count: int, seed: int) -> Report:
 def _answers_alone(bus: ServoBus, servo: EmulatedServo, t: float) -> bool:
     """Return True if the servo replies to a ping while all other servos are silent.
 
-    The other servos are silenced, because a servo may have the same ID as another servo.
+    The other servos are silenced, because two servos may have the same ID.
     """
     for each in bus.servos:
         each.silent = each is not servo
-    servo.table.set(reg.PROTOCOL_TYPE, 2)  # A write may have selected protocol 1.
+    servo.table.set(reg.PROTOCOL_TYPE, 2)  # An earlier write may have selected Protocol 1.0.
     found = PacketParser().feed(bus.feed(frame(BROADCAST, framing.PING), t), 0.0)
     return [packet.id for packet in found] == [servo.id]

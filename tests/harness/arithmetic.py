@@ -1,4 +1,4 @@
-"""Report or change the floating-point environment, on which the last bits of results depend.
+"""Report or change the floating-point environment, which affects the last bits of results.
 
 ``python -m tests.harness.arithmetic MODULE …`` runs ``python -m MODULE …`` in a different
 environment. In this environment, OpenBLAS uses the kernels of an older processor. NumPy uses only
@@ -26,7 +26,7 @@ _AVX512 = ("skylakex", "cooperlake", "sapphirerapids")  # OpenBLAS cores that us
 
 
 def chosen() -> dict[str, str]:
-    """Return the override variables that are set (usually none)."""
+    """Return those of VARIABLES that are set in this process (usually none)."""
     return {name: os.environ[name] for name in VARIABLES if os.environ.get(name)}
 
 

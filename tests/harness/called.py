@@ -1,4 +1,4 @@
-"""Compile inner kernels, which Python cannot call directly, as kernels for tests."""
+"""Compile inner kernels as kernels that tests can call from Python."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """Find and kill processes that tests started, directly or indirectly.
 
-As a program, this module waits until its standard input closes. The program then kills every
-process whose environment contains the program's argument.
+If this module runs as a program, it waits until its standard input closes. The program then kills
+every process whose environment contains the program's argument.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ def adopt_orphans() -> None:
 
 
 def end_with_this_process() -> None:
-    """Ensure that child processes are killed when this process ends, even if SIGKILL ends it."""
+    """Ensure that child processes are killed when this process ends or is itself killed."""
     word = f"TESTS_OF_PROCESS={os.getpid()}"
     _watching.append(
         subprocess.Popen(

@@ -50,7 +50,7 @@ def parse(words: list[str]) -> None:
 
 
 class Softfinger:
-    """Stand-in for the ``softfinger`` program, in ``folder``; `serve` executes one call."""
+    """Replacement for the ``softfinger`` program, in ``folder``; `serve` executes one call."""
 
     def __init__(self, folder: Path) -> None:
         client, command = folder / "client.py", folder / "softfinger"

@@ -79,7 +79,7 @@ class EmulatorProcess:
 
 
 class PatientPort(PortHandler):
-    """Port that waits a minute for a reply, because a busy machine may exceed the SDK's 34 ms."""
+    """Port with a reply timeout of one minute, because the SDK's 34 ms may be too short."""
 
     patience = 60_000.0  # ms
 

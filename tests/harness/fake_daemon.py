@@ -1,6 +1,6 @@
 """Publish computed states and serve commands on real sockets, without a hand or a daemon.
 
-Client tests connect to these sockets and choose all messages.
+The tests of clients connect to these sockets and define the messages.
 """
 
 from __future__ import annotations

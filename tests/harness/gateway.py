@@ -66,7 +66,7 @@ class Served:
         for _ in range(times):
             self.service.step(0.0)
             self.link.look()
-        # A long message takes several steps.
+        # The gateway reads a long message in several steps.
         while select.select([self.service.channel], [], [], 0)[0]:
             self.service.step(0.0)
 
@@ -76,7 +76,7 @@ class Served:
         return bool(self.service.commands.socket.poll(0))
 
     def serve(self, handler: Handler) -> None:
-        """Run one gateway step, one loop tick, and one gateway step for the replies."""
+        """Run a gateway step, a loop tick, and another gateway step that sends the replies."""
         self.service.step(0.0)
         self.server.serve(handler)
         self.service.step(0.0)

@@ -24,7 +24,7 @@ MADE_ON = GOLDEN / "grasp_and_turn.json"
 _COMMANDS = {
     50: {"command": "arm"},
     51: {"command": "grasp", "force": 6.0},
-    500: {"command": "move", "left": 0.1},  # The daemon refuses this command while holding.
+    500: {"command": "move", "left": 0.1},  # A hand that holds an object refuses this command.
     550: {"command": "rotate", "angle": 0.1},
     800: {"command": "release"},
     930: {"command": "stop"},

@@ -120,7 +120,7 @@ def sample(topic: bytes) -> dict[str, Any]:
 
 
 def flat(message: dict[str, Any], outer: str = "") -> dict[str, Any]:
-    """Flatten nested maps; for example, q in ``left`` becomes ``left.q``."""
+    """Flatten nested maps; for example, the key q in the map ``left`` becomes ``left.q``."""
     found: dict[str, Any] = {}
     for key, value in message.items():
         name = f"{outer}{key}"

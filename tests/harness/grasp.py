@@ -8,9 +8,9 @@ d_t, a tip's energy is
 where U₀ and F are taken from the contact table. For a constant modulus, the parallel-distributed
 model gives U = πE[d³/(3cos²θ) + d² d_t tan θ + d d_t²]. The shear force is T = ∂U/∂d_t and the
 normal force is N = ∂U/∂d − T tan θ. The shear displacements are computed from the rolling
-increments of `reference_hand`. The increments are not integrable in general, so a grasp depends on
-its path. Motions are therefore divided into small steps, and the shears of the steps are summed.
-The grasp is at equilibrium if the energy is stationary along the rolling increments.
+increments of `reference_hand`. In general, the increments are not integrable, so a grasp depends on
+the path of the motion. Motions are therefore divided into small steps, and the shears of the steps
+are summed. The grasp is at equilibrium if the energy is stationary along the rolling increments.
 """
 
 from dataclasses import dataclass

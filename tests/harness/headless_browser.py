@@ -1,6 +1,6 @@
 """Control a headless Chromium through DevTools: open pages and evaluate scripts.
 
-The browser stores all data in a test folder and sends no requests except the page's requests.
+The browser stores all data in a test folder and sends only the requests that the page makes.
 """
 
 import json
@@ -77,7 +77,7 @@ class Browser:
         self.ask("Emulation.setDeviceMetricsOverride", **size)
 
     def evaluate(self, script: str) -> Any:
-        """Return the value of a JavaScript expression in the page.
+        """Evaluate a JavaScript expression in the page and return its value.
 
         Returns None if the page is reloaded before the browser has evaluated the expression.
         """

@@ -1,10 +1,10 @@
-"""Simulate a machine that wakes up late on request."""
+"""Simulate a machine whose wake-ups are delayed on request."""
 
 from softfinger.daemon.clock import VirtualClock
 
 
 class LateMachine(VirtualClock):
-    """Replacement for the real clock, for tests. Only `work` and sleeps advance the time.
+    """Test clock that replaces the real clock. Only `work` and sleeps advance the time.
 
     ``late_by`` holds the delays of the next wake-ups [s].
     """

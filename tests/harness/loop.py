@@ -22,7 +22,7 @@ def torque_of(daemon: Daemon) -> Any:
 
 
 def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
-    """Advance until the hand is in ``mode``; fail after ``seconds``."""
+    """Advance until the hand is in ``mode``; fail if this takes longer than ``seconds``."""
     finish = daemon.clock.now() + seconds
     while daemon.loop.state.mode != mode:
         assert daemon.clock.now() < finish, f"mode is {daemon.loop.state.mode}, expected {mode}"

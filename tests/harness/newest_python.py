@@ -1,4 +1,4 @@
-"""Print the newest Python release that PATH or pyenv provides on this machine."""
+"""Print the newest Python release installed on PATH or by pyenv."""
 
 import os
 import re

@@ -36,7 +36,7 @@ def place(hand: SimulatedHand, q, pose, dq=(0, 0), velocity=(0, 0, 0)) -> None:
 
 
 def hold_with(hand: SimulatedHand, currents) -> None:
-    """Apply constant motor currents, which do not decrease with the joint velocity."""
+    """Apply motor currents that stay constant at any joint velocity."""
     hand.plant.parameters.no_load_speed = 1e9
     hand.current[:] = currents
     for joint in range(2):

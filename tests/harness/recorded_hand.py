@@ -17,10 +17,10 @@ def record_hand(
     profile: str | None = None,
     hand: tuple[str, ...] = (),
 ) -> list[str]:
-    """Record a run; ``due`` maps ticks (500 per second) to the commands that are sent then.
+    """Record a run; ``due`` maps ticks (500 per second) to the commands sent at these ticks.
 
     ``hand`` contains settings that apply only to the simulated hand, not to the daemon. Returns the
-    reasons for which commands were refused.
+    reason for each refused command.
     """
     refused = []
     with VirtualHand(profile, changes, hand) as made, made.record(path):

@@ -41,7 +41,7 @@ class ReferenceHand(HandGeometry):
         return np.array([tip_velocity(q1, 1.0, *lengths), tip_velocity(q2, -1.0, *lengths)])
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Return the derivatives (2, 3, 5) of each tip's (d, θ, s), by complex steps."""
+        """Return the derivatives (2, 3, 5) of each tip's (d, θ, s), computed by complex steps."""
         return np.asarray(self.variables(x[:, None] + 1e-30j * np.eye(5), 0.0).imag / 1e-30)
 
     def rolling_rows(self, x: FloatArray, width: float) -> FloatArray:

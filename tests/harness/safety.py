@@ -1,4 +1,4 @@
-"""Create states, and `Safety` objects that check these states, for tests of the limits."""
+"""Create states for tests of the limits, and `Safety` objects that check the states."""
 
 from typing import Any, cast
 
@@ -44,7 +44,7 @@ def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> S
 
 
 def sound(mode: Mode = Mode.HOLDING) -> State:
-    """Return a state at 5 s without faults."""
+    """Return a fault-free state with the time 5 s."""
     state = State(t=5.0, mode=mode, torque=True, seq=10)
     state.reading.t = 5.0
     state.reading.valid = True
@@ -104,7 +104,7 @@ def levers(lever: float) -> GraspState:
 
 
 def judged(judge: Safety, state: State, seconds: float = 0.0) -> tuple[str, str]:
-    """Check the unchanged state for ``seconds``, each limit at least once; return the fault."""
+    """Check the same state repeatedly for ``seconds``; return the fault. Every limit is checked."""
     found = None
     for _ in range(max(round(seconds / 0.002), len(LIMITS)) + len(LIMITS)):
         found = judge.judge(state)

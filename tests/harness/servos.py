@@ -1,6 +1,6 @@
 """Create emulated servo buses, which are called directly or served on a pty by a thread.
 
-Tests of the timing run the bus in a separate process instead.
+Timing tests run the bus in a separate process instead.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def lasting_notices(backend: DynamixelServos) -> list[Finding]:
 
 
 class BusClient:
-    """Bus client that has its own time and parses the replies of one servo."""
+    """Bus client that has its own clock and parses the replies of one servo."""
 
     def __init__(self, bus: ServoBus) -> None:
         self.bus = bus
@@ -99,7 +99,7 @@ class BusClient:
 class DirectPort(SerialPort):
     """Port connected directly to a bus, so a reply is available immediately or never.
 
-    The bus takes its time from ``clock``. Without a clock, the bus uses ``t``, which the test sets.
+    The bus reads the time from ``clock``. Without a clock, the bus uses ``t``, which the test sets.
     If a reply is missing, the wait advances ``t`` by the reply timeout. If ``baud`` is 0, the
     servos accept any baud rate.
     """
@@ -135,7 +135,7 @@ class DirectPort(SerialPort):
 
 
 class RunningBus(EmulatedBus):
-    """Bus served by a thread, by default with the servos of the settings."""
+    """Bus served by a thread; by default, the settings define the bus's servos."""
 
     def __init__(self, bus: ServoBus | None = None, baud: int = 0, **options: Any) -> None:
         super().__init__(baud=baud, bus=bus or hand_bus(baud=baud, **options))

@@ -32,7 +32,7 @@ class _Rings(SolidTip):
     edges = RING_EDGES
 
     def __init__(self) -> None:
-        """Skip the fitted data, because frames need only the rings."""
+        """Do not load the fitted data, because computing frames requires only the rings."""
 
 
 def row(block: str, theta: float, press: Strained) -> dict[str, object]:

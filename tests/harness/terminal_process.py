@@ -82,7 +82,7 @@ class TerminalProcess:
         os.write(self.master, keys)
 
     def press(self, key: bytes, text: str) -> None:
-        """Press a key until ``text`` appears; a busy machine may lose a single key press."""
+        """Press a key repeatedly until ``text`` appears; a busy machine may lose a key press."""
         while text not in self.text():
             self.type(key)
             later = time.monotonic() + 1.0
@@ -99,7 +99,7 @@ class TerminalProcess:
         self.pump()
         pairs = ((b"\x1b[?1049h", b"\x1b[?1049l"), (b"\x1b[?25l", b"\x1b[?25h"))
         pairs += ((b"\x1b[?2004h", b"\x1b[?2004l"),)
-        # The process must have sent both sequences of each pair, and the restoring sequence last.
+        # For each pair, the process must have sent the first sequence and later the second.
         given = all(0 <= self.written.rfind(a) < self.written.rfind(b) for a, b in pairs)
         return given and termios.tcgetattr(self.slave) == self.attributes
 

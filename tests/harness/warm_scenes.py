@@ -61,7 +61,7 @@ SCRIPT: list[tuple[float, dict[str, Any]]] = [
 
 
 class Watch(event.Listener):
-    """Record when kernels are compiled or loaded from the cache, because either delays a tick."""
+    """Record when kernels are compiled or loaded from the cache, since both delay a tick."""
 
     def __init__(self) -> None:
         self.heard: list[str] = []
@@ -80,7 +80,7 @@ class Watch(event.Listener):
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Run the script; report the compilations before the script, and those the warm-up missed."""
+    """Run the script; report the kernels compiled before and during the script."""
     watch = Watch()
     modes, faults = [], []
     with event.install_listener("numba:compiler_lock", watch):
@@ -96,7 +96,7 @@ def run(settings: Settings) -> dict[str, Any]:
                     break
                 hand.loop.advance(0.1)
             fault = hand.loop.state.fault_name
-            with contextlib.suppress(Refused):  # Some scenes do not support every command.
+            with contextlib.suppress(Refused):  # Not every scene supports every command.
                 hand.loop.command(request)
             hand.loop.advance(hand.loop.period)
             modes.append(hand.loop.state.mode)

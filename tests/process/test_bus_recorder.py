@@ -17,7 +17,7 @@ UNIT = by_name("XM430-W350").current_unit
 
 
 class Hand(BusClient):
-    """Client for a configured hand; higher counts close the left finger and open the right one."""
+    """Client for a configured hand; higher counts close the left and open the right finger."""
 
     def __init__(self) -> None:
         super().__init__(hand_bus(10.0))
@@ -39,7 +39,7 @@ def test_extreme_goals_are_recorded_including_refused_ones():
     assert left["goal_q"] == pytest.approx([-50 * RADIAN, 100 * RADIAN])
     assert left["goals_refused"] == 0
     assert hand.report(2)["goal_q"] is None
-    # The goals exceed the model's range and the configured limit while torque is off.
+    # With torque off, write goals beyond the model's range and beyond the configured limit.
     assert hand.write(reg.GOAL_CURRENT, 5000, 2) == framing.DATA_RANGE
     assert hand.report(1)["goal_current"][1] == pytest.approx(5000 * UNIT)
     hand.write(reg.CURRENT_LIMIT, 200, 2)
@@ -63,7 +63,7 @@ def test_goals_by_group_writes_and_indirect_addresses_are_recorded():
     data = struct.pack("<HHB", 224, 6, 1) + goal + b"\x02" + goal
     hand.bus.feed(frame(BROADCAST, framing.SYNC_WRITE, data), hand.t)
     assert hand.report(1)["goal_q"] == pytest.approx([40 * RADIAN] * 2)
-    # The right joint turns in the opposite direction.
+    # The right joint counts in the opposite direction.
     assert hand.report(2)["goal_q"] == pytest.approx([-40 * RADIAN] * 2)
     assert hand.report(2)["goal_current"] == pytest.approx([-10 * UNIT] * 2)
 

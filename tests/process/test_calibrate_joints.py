@@ -11,7 +11,7 @@ from softfinger.tools.calibration.joints import put
 from softfinger.tools.cli import main
 from tests.harness.emulated import HIL, SdkServos, emulated
 
-# Actual settings of the emulated hand; the profile differs. The object is out of reach.
+# Actual settings of the emulated hand, which differ from the profile. The object is out of reach.
 TRUTH = [
     "servos.ids=[2,1]",
     "servos.direction=[-1,1]",

@@ -59,7 +59,7 @@ def test_duration_and_settings_on_the_command_line(profile, inline):
 def test_a_second_daemon_reports_the_used_address_and_exits(daemon):
     second = softfinger("run", "--config", str(daemon.profile))
     assert second.returncode == 1
-    # Both addresses are in use, and the daemon reports either of them.
+    # Both addresses are in use, and the daemon reports one of them.
     taken = (f"stream.address: {daemon.addresses[0]}", f"commands.address: {daemon.commands}")
     assert any(f"{each} is in use; is another softfinger" in second.stderr for each in taken)
 

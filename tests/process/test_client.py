@@ -41,7 +41,7 @@ from tests.harness import fake_daemon
 from tests.harness.daemon_process import python
 from tests.harness.fake_daemon import FakeDaemon
 
-IN_VAIN = 6.0  # timeout [s] of waits that must fail; even a busy machine delivers a state sooner
+IN_VAIN = 6.0  # timeout [s] of waits that must fail
 
 
 @pytest.fixture
@@ -236,7 +236,7 @@ def test_a_cancelled_command_is_not_repeated(fake):
                 await arming
 
     fake.replies["arm"] = LATE
-    asyncio.run(cancelled())  # This call returns after the current attempt.
+    asyncio.run(cancelled())  # This call returns when the current attempt ends.
     count, published = len(fake.requests), fake.published
     until(lambda: fake.published > published + 50)  # Wait for half a second.
     assert len(fake.requests) == count
@@ -258,11 +258,11 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, and no message was lost.
     gaps.take({"seq": 10, "seq_step": 5})
     assert gaps.lost == 2
-    for finger in ("left", "right"):  # Losses are counted for each finger.
+    for finger in ("left", "right"):  # Lost frames are counted per finger.
         for seq in (1, 2, 4):
             gaps.take({"seq": seq, "finger": finger})
     assert gaps.lost == 4
-    for seq, number in ((10, 1), (15, 2), (16, 4)):  # Frames have their own numbers.
+    for seq, number in ((10, 1), (15, 2), (16, 4)):  # Frames are numbered separately.
         gaps.take({"seq": seq, "seq_step": 1, "number": number, "finger": "middle"})
     assert gaps.lost == 5
     again = Gaps()
@@ -477,7 +477,7 @@ def in_a_thread(use: Callable[[], object]) -> BaseException | None:
 
 def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     states = hand.stream(60.0)
-    assert in_a_thread(hand.grasp) is None  # Commands use a separate socket.
+    assert in_a_thread(hand.grasp) is None  # Commands use another socket than states.
     next(states)
     for use in (
         lambda: next(states),

@@ -57,7 +57,7 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     # `table.kernels` is the count for the newest Numba version. The oldest supported version
     # reports a third fewer kernels.
     assert 0.6 * table.kernels <= len(kernels) <= 1.2 * table.kernels
-    # Mark the second set of kernels as compiled, in addition to the contact tables.
+    # Mark both sets of kernels as compiled.
     (mark,) = (tmp_path / "softfinger").glob("kernels-*/contact-table-springs.built")
     mark.with_name("joints-and-timing-springs.built").touch()
     again = compiled(tmp_path)

@@ -83,7 +83,7 @@ def test_torque_on_starts_at_the_current_position(bus, connect):
     assert read(backend).q == pytest.approx([0.4, -0.3], abs=RADIAN)
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
-    # This write gets no reply.
+    # The servos do not reply to this write, so wait for its effect.
     until(lambda: all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1)))
 
 
@@ -199,7 +199,7 @@ def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connec
         """Move the joints to ``count``, and check that a reading does not show an earlier angle."""
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
-        if reading.valid:  # The reading may also be invalid because this thread was suspended.
+        if reading.valid:  # A reading may also be invalid if the system suspended this thread.
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
 
     bus.fault("late=1")
@@ -218,7 +218,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
     until(lambda: bus.memory(0)[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR)
 
     def look() -> None:
-        for _ in range(2):  # The first read checks the supply voltage.
+        for _ in range(2):  # The first reading includes the voltage check.
             backend.read(Reading())
 
     with pytest.raises(ServoError, match="the bus watchdog stopped the servo"):
@@ -233,7 +233,7 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
     "what", ["the bus watchdog stopped the servo", "the bus watchdog is off, possibly because"]
 )
 def test_a_servo_that_stopped_by_itself_is_detected_despite_timely_writes(bus, connect, what):
-    # A servo may stop by itself if an adapter delays packets or if power is lost briefly.
+    # If an adapter delays packets or power is lost briefly, a servo may stop by itself.
     backend = connect(bus)
     backend.torque_on()
     goal, reading = Goal(q=[0.1, 0.1], current=[0.05, 0.05]), Reading()

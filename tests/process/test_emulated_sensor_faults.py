@@ -23,12 +23,12 @@ LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
 CURRENT = "left:current=2"
-REFUSED = "left:shift-x=3"  # fault after which the hand releases the object
+REFUSED = "left:shift-x=3"  # fault that makes the hand release the object
 
 
 @contextlib.contextmanager
 def running(hand: Sequence[str] = ()) -> Iterator[Rig]:
-    """Yield an emulated hand and its daemon, which share a clock that tolerates a busy machine.
+    """Yield an emulated hand and its daemon, which share a clock that pauses on a busy machine.
 
     ``hand`` contains additional settings for the hand.
     """

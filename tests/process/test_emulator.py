@@ -113,7 +113,7 @@ def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues
         process.popen.send_signal(signal.SIGSTOP)
         assert servos.silent(7)
         process.popen.send_signal(signal.SIGCONT)
-        assert servos.ping(7) == 1200  # The emulator has answered one of the two earlier pings.
+        assert servos.ping(7) == 1200  # The emulator has answered an earlier ping.
         servos.close()
         assert process.end(signal.SIGHUP) == (0, "", "")
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
@@ -205,7 +205,7 @@ def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path,
             apart.append(clock.now() - daemon.now())
     assert max(apart[20:]) - min(apart[20:]) <= 0.0045
     assert daemon.behind > 100 * late or late < 0.002
-    # Time still advances while a reply is being sent, and after the daemon has exited.
+    # The hand's clock still advances during the sending of a reply, and after the daemon exits.
     machine.work(0.01)
     stands = clock.now()
     machine.work(0.01)

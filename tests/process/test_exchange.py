@@ -51,7 +51,7 @@ def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running)
     assert found.text.startswith("50 read and write cycles: p50 ")
     until(lambda: len(re.findall(rb"\xff\xff\xfd\x00\xfe..\x83", heard, re.DOTALL)) == 50)
     reads = re.findall(rb"\xff\xff\xfd\x00\xfe..\x8a", heard, re.DOTALL)
-    assert len(reads) == 54  # The doctor first reads each of the four register spans.
+    assert len(reads) == 54  # The doctor also reads four register spans.
     assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
 
 
@@ -81,7 +81,7 @@ def test_assessment_of_exchange_times():
     assert near.text.endswith(
         "a cycle takes up most of a tick of 2 ms (loop.rate = 500), so ticks will be late"
     )
-    # Both percentiles are longer than a tick and shorter than reply_timeout.
+    # Both percentiles of the exchange time are between a tick and reply_timeout.
     both = judged(0.0028, 0.003)
     assert (both.status, both.fix.split(",")[0]) == ("FAIL", "set loop.rate = 260")
     assert (
@@ -105,7 +105,7 @@ def test_assessment_of_exchange_times():
 
 def test_sync_reads_replace_fast_reads_that_a_firmware_only_claims_to_support(bus):
     for i in (0, 1):
-        bus.servo(i).fast_reads = False  # The firmware version promises fast reads.
+        bus.servo(i).fast_reads = False  # The reported firmware supports fast reads.
     backend = connected(bus)
     (notice,) = [each for each in backend.notices if "fast sync read" in each.text]
     assert notice.fix == "the daemon uses slower normal sync reads"

@@ -78,8 +78,8 @@ def test_frames_are_received_through_a_port_with_their_times(own_threads, board)
     first = tactile.latest()
     until(lambda: tactile.latest().seq >= first.seq + 20)
     now = tactile.latest()
-    # Wait until a read returns a single frame. If a read returns several frames, all frames except
-    # the last frame have waited in the buffer.
+    # Wait until a read returns a single frame. If a read returns several frames, the earlier frames
+    # were delayed in the buffer.
     until(lambda: (n := tactile.latest()).t_arrival - n.t_sample == pytest.approx(LATE))
     assert first.t_arrival <= now.t_arrival <= time.monotonic()
     assert len(set(now.data.ravel().tolist())) == 1
@@ -120,7 +120,7 @@ def test_a_silent_port_is_reported_with_its_name_and_time_out(own_threads, board
     ):
         tactile.open()
     assert not own_threads()
-    # The port can be opened once the board is sending.
+    # Once the board sends frames, opening the port must succeed.
     board.stream(lambda k: frame(bytes(1024)))
     tactile.settings = tactile.settings.model_copy(update={"open_timeout": 60.0})
     assert why_not_open(tactile) == ""

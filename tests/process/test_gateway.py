@@ -190,7 +190,7 @@ def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses)
         for k in range(50_000):  # If publishing waited for the gateway, the loop would never end.
             publisher.event(0.0, 0.0, "info", "test", f"event {k}")
         assert len(gateway.link._channel._unsent) < 1000, "the queue exceeds its limit"
-        with suppress(ProcessLookupError):  # The daemon may have replaced a slow gateway.
+        with suppress(ProcessLookupError):  # The daemon may already have killed a slow gateway.
             os.kill(gateway.process.pid, signal.SIGCONT)
     finally:
         gateway.close()

@@ -151,7 +151,7 @@ def test_a_grasp_over_serial_bytes_with_a_shared_clock(tmp_path, addresses):
             assert not any(each["watchdog_fired"]["count"] for each in rig.report()["servos"])
             hand.arm()
             hand.wait_for(lambda state: state.torque, 120.0)
-        daemon.kill()  # The hand does not wait for a daemon that has exited.
+        daemon.kill()  # The hand does not wait for a dead daemon process.
         until(rig.stopped)
     finally:
         rig.close()
@@ -180,7 +180,7 @@ def test_start_up_waits_for_servos_that_have_not_responded_yet(tmp_path, address
 
 
 def stops_in_time(rig: Rig, lose: Callable[[], object]) -> None:
-    """Check that each active servo stops when its watchdog times out."""
+    """Call ``lose``; check that each active servo stops when its watchdog times out."""
     before = rig.at_work()
     lose()
     until(rig.stopped)
@@ -289,8 +289,7 @@ def test_lost_packets_do_not_keep_torque_on(rig):
 def test_swapped_ids_are_a_fault_during_the_approach(tmp_path, addresses):
     """Use the zero offsets and directions that `calibrate joints` would find for swapped servos."""
     hand = tmp_path / "hand"
-    # A heavy object causes a clear force at the tip that touches it. A light object would slide
-    # away.
+    # A heavy object resists the first tip that touches it. A light object would slide away.
     heavy = ("object_position=[0.006, 0.08]", "object_mass=0.5", "table_friction=0.5")
     words = [word for each in heavy for word in ("--set", f"simulation.{each}")]
     config = tmp_path / "hil.toml"

@@ -169,7 +169,7 @@ def test_the_folder_is_private_and_the_least_recently_used_ones_are_removed(pack
     assert found == ["3.0", "0"], "the kernel must be compiled, not loaded from the cache"
     assert f"{base / new}: other users can write to it (0777): chmod go-w" in told
     (base / new).chmod(0o700)
-    package.cache.chmod(0o777)  # The kernels are in a subfolder of this folder.
+    package.cache.chmod(0o777)  # This folder contains the folder with the kernels.
     found, told = package.run()
     assert found == ["3.0", "0"]
     assert f"{package.cache}: other users can write to it (0777): chmod go-w" in told

@@ -138,7 +138,7 @@ def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, mon
 
 
 class Guarded:
-    """The stream and command sockets of a daemon with keys, which executes commands on arrival."""
+    """The sockets of a daemon that requires keys and executes commands on arrival."""
 
     def __init__(self, addresses: Addresses, folder: Path) -> None:
         self.served = Served(*addresses, keys=str(folder))
@@ -221,7 +221,7 @@ def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addr
     stopper.send(msgpack.packb({"command": "stop"}))
 
     def answered() -> int:
-        guarded.served.link.fence()  # After every stop, the loop sends a fence.
+        guarded.served.link.fence()  # The real loop sends a fence after every stop.
         guarded.step()
         return stopper.poll(0)
 

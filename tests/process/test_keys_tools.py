@@ -76,7 +76,7 @@ def test_tools_with_keys_see_and_command_the_hand(guarded, tmp_path, inline):
             return (await hand.wait_for(lambda state: not state.torque, 60.0)).mode
 
     assert asyncio.run(session()) == "disarmed"
-    # A user who is permitted to end the daemon may also stop the hand without a key.
+    # Any user who may kill the daemon process may also stop the hand, even without a key.
     assert ask(commands, "stop")["ok"]
 
 
@@ -97,7 +97,7 @@ def test_tools_without_keys_receive_nothing_and_suggest_the_option(guarded, tmp_
         said = tool.communicate(timeout=300)[1]
         assert tool.returncode in (1, 2), tool.args
         assert "--keys" in said, tool.args
-    # Unreadable keys are reported before a file is created.
+    # If keys are missing, the tool reports this and does not create the recording.
     path = tmp_path / "c.mcap"
     done = inline("record", path, "--address", stream, "--keys", tmp_path / "none")
     assert done.returncode == 1

@@ -12,7 +12,7 @@ from softfinger.daemon.wire.schema import Event
 from tests.conftest import Addresses
 from tests.harness.daemon_process import Running
 
-STILL = 1.0  # duration of a stall [s]; ten times the watchdog time and the maximum frame age
+STILL = 1.0  # duration of a stall [s], far above the watchdog time and the frame age limit
 PATIENCE = 60.0  # timeout for an event on a busy machine [s]
 
 
@@ -44,7 +44,7 @@ def test_a_simulated_hand_survives_a_suspended_machine(start, profile, hand):
         for mode in ("rotating", "holding", "releasing", "grasping"):
             state = after(states, mode)
             assert state.fault == ""
-        # The hand's time advances only while its process runs.
+        # The hand's clock advances only while its process runs.
         assert state.behind_s >= before.behind_s + 0.9 * STILL
         passed = 1e-9 * (state.mono_ns - before.mono_ns)
         assert passed == pytest.approx((state.seq - before.seq) / 100.0)

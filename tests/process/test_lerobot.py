@@ -101,7 +101,7 @@ def test_lerobot_drives_and_records_the_simulated_hand(make, start, profile, tmp
     )
     assert held["left_touch"].max() > first["left_touch"].max()
     assert robot.send_action(grip)["grip.force"] == 5.0
-    # A frame newer than the state may have arrived.
+    # The age is negative if the frame is newer than the state.
     assert abs(held["left.touch_age"]) < 60.0
     act_until(
         robot,

@@ -39,7 +39,7 @@ def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        # The page first shows the stream as stale, for at most 1.5 s.
+        # For up to 1.5 s, the page shows the stream as stale; it then shows the stream as lost.
         page.shows("○ lost", "the stream has stopped")
         fake.changes = {}
         fake.silent.clear()
@@ -90,7 +90,7 @@ def test_a_signal_ends_it_while_the_terminal_is_blocked(fake):
     with TerminalProcess(command(fake)) as page:
         page.shows("HOLDING")
         termios.tcflow(page.slave, termios.TCOOFF)  # Suspend the output as Ctrl-S does.
-        # Wait for several redraws, whose maps contain different noise.
+        # Wait for several redraws of the maps.
         until_later = fake.published + 50
         until(lambda: fake.published >= until_later)
         page.process.terminate()
@@ -124,7 +124,7 @@ def test_keys_command_the_hand(fake):
         page.shows("LEFT contact")
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
-        # The second key press changes the last target, although the object angle is still 4.98°.
+        # The second key press adds 5° to the last target, not to the measured angle of 4.98°.
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 15.0°")
         page.type(b"\x1bOD")
@@ -169,14 +169,15 @@ def test_the_grasp_force_is_selected_and_updates_a_grip(fake):
         page.type(b"++")
         page.shows("+- 12 N")
         page.type(b"+")
-        page.shows("+- 12.6 N")  # The displayed force is nine tenths of the force limit.
+        page.shows("+- 12.6 N")  # The maximum is 0.9 of the force limit.
         page.type(b"-" * 10)
         page.shows("+- 4 N")  # Below 5 N, the steps are smaller.
         assert fake.requests == []
         page.type(b"g")
         page.shows("✓ grasp with 4 N: ok")
         assert asked() == [4.0]
-        # During a grip, the keys change the force that any client commanded last.
+        # During a grip, the keys change the last commanded force, even if another client commanded
+        # it.
         fake.changes = {"goal_force": 9.0}
         page.shows("HOLDING", "+- 9 N")
         told = {"command": "grasp", "client": "", "request": '{"force": 7.0}', "ok": True}

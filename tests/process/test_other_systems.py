@@ -29,7 +29,7 @@ PORTABLE = (
     "softfinger.tools.viewing.view",
 )
 
-# None of these names exist on Windows. macOS lacks `sched_*`, epoll and some of the flags.
+# Windows defines none of these names. macOS lacks `sched_*`, epoll and some of the flags.
 ELSEWHERE = """
 import importlib, os, select, signal, sys
 import dynamixel_sdk, numba, pyarrow, zmq  # theirs is their own business

@@ -11,9 +11,9 @@ from tests.harness.daemon_process import python
 from tests.harness.golden_recording import machine_class
 from tests.harness.paper_tip import MEASURED, TIP
 
-# The script tests each kind of kernel. The tables use SIMD lanes and selected callees, and the
-# estimator uses reorderable sums. The loops over the cells of a frame are inlined, and the grip
-# uses nested records.
+# The script tests each kind of kernel. The tables use SIMD lanes and selected callees. The
+# estimator uses reorderable sums and inlined loops over the cells of a frame. The grip uses nested
+# records.
 SCRIPT = """
 import sys
 import numba
@@ -36,8 +36,8 @@ sys.exit(failed)
 """
 
 
-# On this processor, both compilers produce bit-identical results. On other processors, the
-# compilers may fuse other multiplications and additions.
+# On this processor, both compilers produce bit-identical results. On other processors, the two
+# compilers may differ in which multiplications and additions they fuse.
 SAME_BITS = "znver3"
 
 

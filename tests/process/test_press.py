@@ -17,7 +17,7 @@ RUBBER = ["tip.physics=solid", "tip.poisson=0.48", "safety.d_max=0.008", *LINEAR
 
 
 class Stage:
-    """Simulated user, who applies each load on the test stand and then presses Enter."""
+    """Simulated user of the test stand, who applies each load and then presses Enter."""
 
     def __init__(self, folder, presses):
         self._folder, self._presses = folder, list(presses)

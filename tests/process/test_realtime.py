@@ -177,7 +177,7 @@ def test_ticks_over_ptys_alternate_with_their_exchanges():
     reports: list[Report] = []
 
     def measured() -> bool:
-        """Return True if the attempt succeeded; a grip may take too long on a busy machine."""
+        """Measure once; return False if the grip took too long, as it may on a busy machine."""
         part = partial(tick.in_the_loop, "paced", 2, 2_000_000, patient)
         reports.append(attempt("paced", part))
         return not reports[-1].failed

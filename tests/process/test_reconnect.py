@@ -41,7 +41,7 @@ class Rig:
         until(lambda: self.loop.advance(0.1) or condition())
 
     def does(self, name: str) -> dict[str, Any]:
-        """Wait for a valid reading, except before ``clear``; issue a command that must succeed."""
+        """Wait for a valid reading, except for ``clear``; then send a command that must succeed."""
         if name != "clear":
             self.until(lambda: self.loop.state.reading.valid)
         return self.loop.command({"command": name})
@@ -82,7 +82,7 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     rig.until(lambda: loop.state.mode == "fault")
     assert "the port is lost" in loop.state.fault
     assert rig.torque() == [1, 1]  # The daemon could not switch torque off.
-    # From here on, `clear` reopens the port.
+    # After the lost port's timeout, `clear` tries to reopen the port.
     rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
     rig.refuses("clear", "port not found")
     rig.plug()

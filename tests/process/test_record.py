@@ -73,7 +73,7 @@ def test_read_messages_equal_the_published_ones(tmp_path):
     recording = Recording(tmp_path / "a.mcap")
     read = list(recording.messages())
     assert read == sent
-    # The types of all values are equal, so the messages can be published again byte for byte.
+    # All values keep their types, so the messages can be published again byte for byte.
     for (_, before), (_, after) in zip(sent, read, strict=True):
         assert {key: type(value) for key, value in before.items()} == {
             key: type(after[key]) for key in before
@@ -287,7 +287,7 @@ def test_messages_sent_before_the_end_are_written(addresses, tmp_path):
     for k in range(4000):
         publisher.send(schema.STATE, zmq.SNDMORE)
         publisher.send(pack({**message, "seq": k}))
-    context.destroy(linger=-1)  # This call returns once everything is sent.
+    context.destroy(linger=-1)  # This call returns after all messages are sent.
     process.send_signal(signal.SIGTERM)
     status, out, _ = ended(process)
     assert status == 0
@@ -315,7 +315,7 @@ def test_the_recorder_waits_for_a_daemon_except_with_no_wait(addresses, tmp_path
     assert "waiting for a stream" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     assert ended(process)[0] == 0
-    assert not list(tmp_path.iterdir())  # No empty file is left behind.
+    assert not list(tmp_path.iterdir())  # The recorder deletes its empty file.
 
 
 def test_invalid_messages_on_the_stream_are_counted_and_omitted(fake, tmp_path):
@@ -344,7 +344,7 @@ def test_topics_are_selected_by_name(fake, tmp_path):
 
 
 def test_repeated_messages_do_not_extend_the_time_range(tmp_path):
-    """A recorder that starts late receives repetitions of the first events and of the settings."""
+    """If a recorder starts late, the daemon repeats the first events and the settings."""
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
     old = {"schema": 1, "seq": 1, "again": True, "timestamp": 1.7e9 - 7200.0, "mono_ns": 5}

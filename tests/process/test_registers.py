@@ -21,7 +21,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 
 LEFT = "servo 1 (left)"
 FIX = "`softfinger doctor --fix`"
-# Registers and values that another program may leave in a servo, with the status and text of the
+# Register values that another program may leave in a servo, each with the status and text of the
 # doctor's finding.
 EEPROM = [
     (reg.RETURN_DELAY_TIME, 250, "FAIL", "return delay is 500 µs, expected at most 50 µs"),
@@ -150,7 +150,7 @@ def test_factory_settings_of_every_model_pass_the_checks():
 
 
 def test_stall_torques_fit_current_speed_and_gears():
-    """For servos with the same motor, the torque constant is inversely proportional to speed."""
+    """If servos have the same motor, their torque constants are inversely proportional to speed."""
     for name, model in MODELS.items():
         torque, current, voltage = model.stall
         assert 0.5 < torque * model.no_load_speed / (voltage * current) < 1.2, name
@@ -199,7 +199,7 @@ def test_invalid_register_files_are_refused(bus, tmp_path):
     assert right == []
 
 
-# Servos in unexpected states, and servos of unexpected types.
+# Servos in unexpected states or of unexpected types
 
 
 def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):

@@ -31,7 +31,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
     due = {
         50: {"command": "arm"},
         51: {"command": "grasp", "force": 6.0},
-        750: {"command": "move", "left": 0.1},  # The daemon refuses this command while holding.
+        750: {"command": "move", "left": 0.1},  # A hand that holds an object refuses this command.
         800: {"command": "rotate", "angle": 0.1},
         1100: {"command": "stop"},
     }
@@ -128,7 +128,7 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_p
     ticks = re.search(r"(\d+) ticks, ", told.stdout)
     assert ticks is not None
     assert int(ticks[1]) > 100
-    # The changed setting changes the goals, even if the hand never gripped on a slow machine.
+    # The changed setting changes the goals, even if a slow machine prevented the grip.
     other = tmp_path / "other.toml"
     other.write_text(profile("safety.current_move = 0.3\n", "base.toml").read_text())
     told = inline("replay", path, "--recompute", "--config", other)

@@ -172,7 +172,7 @@ def test_minor_findings_are_notices(bus):
     goal = bus.memory(0)[span]
     backend.write(Goal(q=[0.5, 0.5], current=[1.0, 1.0]))
     backend.close()
-    assert bus.memory(0)[span] == goal  # A servo with torque on is not changed.
+    assert bus.memory(0)[span] == goal  # Connecting does not change a servo with torque on.
     assert servo.torque_on
 
 

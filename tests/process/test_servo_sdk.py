@@ -32,7 +32,7 @@ def line(bus: RunningBus) -> Iterator[Line]:
 )
 def test_arbitrary_bytes_are_transferred_unchanged(bus, line, data, kind):
     port, handler = line
-    start = 224  # Indirect data that refer to themselves behave like memory.
+    start = 224  # Indirect data registers that refer to themselves behave like memory.
     assert handler.writeTxRx(port, 1, start, len(data), list(data)) == (OK, 0)
     assert bus.memory(0)[start : start + len(data)] == data
     assert handler.readTxRx(port, 1, start, len(data)) == (list(data), OK, 0)

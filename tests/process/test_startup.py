@@ -1,4 +1,4 @@
-"""Test subcommands with missing packages or with Ctrl-C during an import; test shell completion."""
+"""Test subcommands if packages are missing or Ctrl-C arrives in an import; test completion."""
 
 import signal
 import subprocess

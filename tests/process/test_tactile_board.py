@@ -92,7 +92,7 @@ def test_the_next_event_is_the_next_frame_delivery():
         source.make(seq)
         made.service(t)
         assert made.next_event() == pytest.approx(due)
-    made.service(0.0562)  # The frame is late, so the board soon checks for it again.
+    made.service(0.0562)  # The frame is late, so check for it soon.
     assert made.next_event() == pytest.approx(0.0567)
     made.service(0.0638)
     assert made.next_event() == pytest.approx(0.064)
@@ -104,7 +104,7 @@ def test_without_a_reader_only_whole_frames_are_dropped(cells):
     writer = FrameWriter()
     rng = np.random.default_rng(0)
     frame = rng.bytes(cells)
-    # The kernel updates the number of unread bytes with a delay.
+    # The kernel's count of unread bytes lags.
     sent: list[bool] = []
     until(lambda: sent.append(writer.send(frame)) or writer.dropped >= 150)
     assert writer.dropped == sent.count(False)

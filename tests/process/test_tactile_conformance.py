@@ -38,7 +38,7 @@ def test_a_frame_object_is_kept_until_a_newer_one_and_never_modified(rig):
     assert later.t_arrival > first.t_arrival
     assert later.t_sample > first.t_sample
     assert np.array_equal(first.data, kept)
-    if rig.backend in ("simulated", "replay"):  # Only the test advances the time.
+    if rig.backend in ("simulated", "replay"):  # The time advances only if the test advances it.
         assert rig.sensor.latest() is later
 
 

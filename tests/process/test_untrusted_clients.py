@@ -50,7 +50,7 @@ def place(address: str) -> tuple[str, int]:
 
 
 def said_to(request: bytes, address: str, wait: Callable[[], object]) -> bytes:
-    """Send ``request``, call ``wait``, and return the bytes received in reply."""
+    """Send ``request``, call ``wait``, and return the bytes that the daemon sends in reply."""
     with socket.create_connection(place(address), timeout=60.0) as raw:
         raw.sendall(request)
         wait()

@@ -59,7 +59,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Kept:
-    """Compute pictures in the test process; store the newest picture, scene and rows."""
+    """Store the newest picture, scene and rows, which are computed in the test process."""
 
     def __init__(self, *, live: bool = False) -> None:
         self.newest: dict[str, Any] = {}
@@ -99,7 +99,7 @@ def location(host: str, path: str) -> str:
 
 
 def ask(host: str, query: str, asked: Any, **more: Any) -> str:
-    """Send a command, or other text, as a page does; return the reply."""
+    """Send a command or any other text to the viewer as a page does; return the reply."""
     with connect(f"ws://{host}/command{query}", proxy=None, open_timeout=WAIT, **more) as line:
         line.send(orjson.dumps(asked).decode())
         return str(line.recv(timeout=WAIT))
@@ -148,7 +148,7 @@ def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
             # The viewer waits.
             assert any("no reply to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
-            assert viewed.process.wait(WAIT) == 1  # The viewer never displayed a picture.
+            assert viewed.process.wait(WAIT) == 1  # No picture was displayed.
 
 
 def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
@@ -166,7 +166,7 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # The page's queue holds 5 s of pictures.
+                return fake.published > begun + 500  # 5 s of pictures fill the page's queue.
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
@@ -233,8 +233,8 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         # There are 31 levels for 50 kPa, and the peak is 45 kPa.
         assert levels.max() > 20
         assert levels[20:24, 20:24].min() > 10
-        assert levels[:8].max() < 6  # This area contains only noise.
-        # The lines are the rim and the footprint.
+        assert levels[:8].max() < 6  # These cells measure only noise.
+        # These lines show the rim and the footprint.
         assert len(picture["panels"][name]["lines"]) == 2
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
@@ -308,7 +308,7 @@ def test_panels_for_missing_parts_are_omitted(tmp_path, changes, gone, there):
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[tuple[FakeDaemon, Viewed]]:
-    """Yield a fake daemon and a viewer for tests that do not change either."""
+    """Yield a fake daemon and a viewer; tests that share them must not change their state."""
     with FakeDaemon() as fake, view(fake) as viewed:
         yield fake, viewed
 
@@ -450,7 +450,7 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
             until(lambda: not playback.playing)  # The playback stops at the end.
             assert playback.position == pytest.approx(recording.duration)
             drawn = kept.newest
-            until(lambda: kept.newest is not drawn)  # The playback stays at the end.
+            until(lambda: kept.newest is not drawn)  # The viewer still draws pictures at the end.
             for odd in ("speed 0", "speed fast", "speed 1e9", "speed nan", "nan", "later"):
                 playback.ask(odd)
             playback.ask("speed 0.5")
@@ -545,7 +545,7 @@ def test_invalid_messages_are_tolerated() -> None:
 
 def test_states_are_queued_while_a_picture_is_drawn(context, addresses):
     publisher = context.socket(zmq.XPUB)
-    publisher.setsockopt(zmq.SNDHWM, 2000)  # The daemon uses the same value.
+    publisher.setsockopt(zmq.SNDHWM, 2000)  # This is the daemon's value.
     publisher.bind(addresses[0])
     kept, drawn = Kept(live=True), threading.Event()
     kept.pictures.draw, draw = drawn.wait, kept.pictures.draw
@@ -610,7 +610,7 @@ def test_invalid_input_is_reported_in_one_line(tmp_path, inline, monkeypatch, wo
 
 
 def test_pages_without_a_chosen_port_get_different_ports() -> None:
-    with ExitStack() as stack:  # The first page occupies its port.
+    with ExitStack() as stack:  # Each page keeps its port.
         here = "127.0.0.1"
         ports = [stack.enter_context(listen(here, None)).getsockname()[1] for _ in range(3)]
         assert len(set(ports)) == 3

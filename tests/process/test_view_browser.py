@@ -39,8 +39,7 @@ FRACTION = """((selector, colour) => {
     count += data[k + 3] > 200 && colour.every((value, c) => Math.abs(data[k + c] - value) < 30);
   return 4 * count / data.length;
 })"""
-# Visible text whose contrast is below the WCAG AA minimum, which is 3 for large text and otherwise
-# 4.5.
+# Visible text whose contrast is below the WCAG AA minimum (3 for large text, 4.5 for other text).
 PALE = """(() => {
   const linear = part => part <= 10.31 ? part / 3294.6 : ((part / 255 + 0.055) / 1.055) ** 2.4;
   const parts = colour => colour.match(/[\\d.]+/g).map(Number);
@@ -83,7 +82,7 @@ COVERED = """[...document.querySelectorAll("button, input, select")].filter(each
 
 
 class Page:
-    """The browser's page, and actions for tests of the page."""
+    """The page in the browser, with the actions that tests perform on the page."""
 
     def __init__(self, browser: Browser) -> None:
         self.browser = browser
@@ -129,7 +128,7 @@ class Page:
         self.browser.ask("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], **named)
 
     def place(self, selector: str, across: float) -> tuple[float, float]:
-        """Return the point at mid-height and at the fraction ``across`` of an element's width."""
+        """Return the point of an element at mid-height and at the fraction ``across`` of the width."""
         left, width, top, height = self(
             "(({left, width, top, height}) => [left, width, top, height])"
             f"(document.querySelector('{selector}').getBoundingClientRect())"
@@ -210,7 +209,7 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
         page.focus("[name=grasp]")
         page.key("Space", " ", text=" ")
         hand.wait_for(lambda state: state.mode == "disarmed", 60.0)
-        until(lambda: page.text(".reply") == "✓ stop: ok")  # The grasp button was not pressed.
+        until(lambda: page.text(".reply") == "✓ stop: ok")  # The button was not pressed.
         page.click("[name=tare]")
         until(lambda: page.text(".reply") == "✓ tare: ok")
         hand.collect(1.0)  # The tare averages these frames.
@@ -300,7 +299,7 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         page.mouse("mouseMoved", page.place(plot, 0.9), button="left", buttons=1)
         page.mouse("mouseReleased", page.place(plot, 0.9), button="left", clickCount=1)
         until(lambda: page("view.end") is not None)
-        assert 5.0 < page("view.span") < 8.0  # The zoom shows 0.3 of 20 s and margins.
+        assert 5.0 < page("view.span") < 8.0  # The view shows 30 % of 20 s, plus margins.
         assert page.text("#hold") == "Resume"
         # The labels are times of day.
         assert page("/^[0-9:.]+$/.test(view.label(view.range[0], 1))")
@@ -322,7 +321,7 @@ def test_plots_have_axes_cursor_zoom_and_pause(page, fake):
         assert page("scene.modes.includes('holding')")
         until(lambda: page.text(".legend") == "holding")
         for name in ("left", "right"):
-            scale = page.text(f".{name} .scale")  # The scale follows the peaks of noisy frames.
+            scale = page.text(f".{name} .scale")  # The scale adapts to noisy peaks.
             assert re.fullmatch(r"≤ 3[3-7]0 kPa", scale), scale
         viewed.end()
 
@@ -341,7 +340,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
             return bool(page(value) == [force, force])
 
         until(lambda: shows(9.0))
-        fake.changes = {"goal_force": 12.0}  # Another client has set this force.
+        fake.changes = {"goal_force": 12.0}  # Another client commands this force.
         until(lambda: shows(12.0))
         page.focus(slider)
         page.arrow("Right")
@@ -356,7 +355,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         assert "is being sent" in page.text("#force output")
         fake.deaf.clear()
         until(lambda: forces(fake)[-1] == 16.5)
-        assert len(forces(fake)) <= 3  # The page skips intermediate values.
+        assert len(forces(fake)) <= 3  # The page sends few of the intermediate values.
         until(lambda: page.text("#force output") == "✓ 16.5 N accepted")
         fake.changes = {"goal_force": 16.5}
         until(lambda: page("settings.force.wanted") is None)
@@ -366,7 +365,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         until(lambda: forces(fake)[-1] == 7.3)
         fake.changes = {"goal_force": 7.3}
         until(lambda: page("settings.force.wanted") is None)
-        fake.changes = {"goal_force": 11.0}  # Another client has set this force.
+        fake.changes = {"goal_force": 11.0}  # Another client commands this force.
         until(lambda: page.text("#force output") == "" and shows(11.0))
         fake.changes = {"goal_force": 7.3}
         until(lambda: page("settings.force.value") == 7.3)
@@ -423,7 +422,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         rows = page("past.rows.map(row => row[0])")
         # The rows include the states that were published while the browser was suspended.
         assert rows == [*range(rows[0], rows[0] + len(rows))]
-        page.click("[name=stop]")  # The page's connection was closed before.
+        page.click("[name=stop]")  # The page has reconnected.
         until(lambda: fake.requests[-1]["command"] == "stop")
 
         page("location.reload()")

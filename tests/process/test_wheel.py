@@ -118,7 +118,7 @@ def test_the_wheel_contains_one_package_with_all_its_data(wheel):
 
 @pytest.mark.extended
 def test_a_script_next_to_an_editable_clone_finds_the_package(tmp_path):
-    """The clone's folder, also named softfinger, is on the path before the installed package."""
+    """A folder named softfinger (the clone) precedes the installed package on the path."""
     source = copied(tmp_path / "softfinger")
     assert build("editable", source, tmp_path).returncode == 0
     (packed,) = tmp_path.glob("*.whl")
@@ -157,12 +157,12 @@ def test_folders_with_the_names_of_subpackages_do_not_interfere(wheel, tmp_path)
 
 
 def test_pinned_versions_support_the_oldest_supported_python():
-    """Check that no package in constraints.txt requires a newer Python patch release."""
+    """Check that every package in constraints.txt supports the oldest supported Python."""
     oldest = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     assert oldest.startswith(">=")
     looked_at = 0
     for line in (ROOT / "constraints.txt").read_text().splitlines():
-        with contextlib.suppress(PackageNotFoundError):  # The tests do not require this package.
+        with contextlib.suppress(PackageNotFoundError):  # This package is not installed here.
             wanted = metadata(line.split("==")[0]).get("Requires-Python") or ""
             assert SpecifierSet(wanted).contains(oldest.removeprefix(">=")), f"{line}: {wanted}"
             looked_at += 1

@@ -107,7 +107,7 @@ def least_at_half_load(seed: int, seconds: float = 3600.0) -> float:
 
 
 class Held(NamedTuple):
-    """Result of a grip with more force than the servos can sustain."""
+    """Result of a grip whose force is higher than the servos can sustain."""
 
     # True if the hand lost its grip for any reason.
     dropped: bool
@@ -116,7 +116,7 @@ class Held(NamedTuple):
 
 
 def held(seed: int, seconds: float = 400.0) -> Held:
-    """Grip with 20 to 26 N; the servos have about a fifth of the usual heat capacity."""
+    """Grip with 20 to 26 N, using servos with about a fifth of the usual heat capacity."""
     chance = random.Random(seed)
     factors = (
         chance.uniform(0.9, 1.33),

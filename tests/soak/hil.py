@@ -3,10 +3,10 @@
 A daemon process drives an emulated hand. A recorder, three subscribers and a client connect to the
 daemon. The client grasps, turns, moves and releases the object, and streams setpoints at 50 Hz.
 Meanwhile, faults disturb the servos, the boards and the daemon. Every few seconds, the soak checks
-the emulated hand's record of the servo bus. The memory of each process must stay constant, and all
-lost messages must be counted. Ticks must be as punctual at the end as at the beginning. At least
-three of ten grasps must lead to a hold. The soak counts, reports and clears faults that a busy
-machine causes.
+the emulated hand's record of the servo bus. The memory use of each process must not grow, and the
+clients must count all lost messages. Ticks must be as punctual at the end as at the beginning. At
+least three of ten grasps must lead to a hold. The soak counts, reports and clears faults that a
+busy machine causes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _FAULT_EVERY = 40.0  # average time between faults [s]
 _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # time between setpoints [s]
 _STREAM = 3.0  # duration of a setpoint stream [s]
-_SPLIT = 300  # time per recorder file [s]; the index of an open file uses memory
+_SPLIT = 300  # duration of a recording file [s]; an open file's index uses memory
 # These faults leave the object tilted. The soak then puts the object upright.
 _ASKEW = ("hand.angle", "tip.tilt")
 _DROPPED = 20.0  # time without a grip after which the soak puts the object back [s]
@@ -309,7 +309,7 @@ def _conclude(account: Account) -> None:
 
 
 def subscribe(address: str) -> None:
-    """Print "ready" at the first state and, at the end, the counts of received and lost states."""
+    """Print "ready" at the first state, and the counts of received and lost states at the end."""
     received = 0
     with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
         ending.begin()

@@ -29,7 +29,7 @@ from softfinger.tools.processes.emulate import emulator_process
 
 _PATIENCE = 300.0  # timeout for the start of a process, including kernel compilation [s]
 _STATE_RATE = 250.0  # Hz
-# On a busy machine, the first bytes of the emulated hand may be late.
+# On a busy machine, the first bytes from the emulated hand may arrive late.
 _PATIENT = [word for key in ("servos", "tactile") for word in ("--set", f"{key}.open_timeout=60")]
 _POLL = 0.003  # time between polls of the stream [s]
 _SLACK = 0.05  # tolerance for delays of a process [s]
@@ -167,7 +167,7 @@ Inject = Callable[[Rig, random.Random], End]
 
 
 def _sent(begin: str, end: str = "well", *, places: tuple[Any, ...] = ("",)) -> Inject:
-    """Return a fault that sends words to the emulated hand; one of ``places`` replaces ``{}``."""
+    """Return a fault that sends words to the hand, with ``{}`` replaced by one of ``places``."""
 
     def inject(rig: Rig, chance: random.Random) -> End:
         place = chance.choice(places)
@@ -230,8 +230,8 @@ CASES: dict[str, Inject] = {
 def judge_wire(rig: Rig) -> str:
     """Return an error found in the emulated hand's record of the servo bus, or "".
 
-    Goals must be within their limits. Torque must not be switched on far from the goal. While
-    torque is on, packets must keep arriving.
+    In the record, goals must be within their limits. Torque must not be switched on far from the
+    goal. While torque is on, packets must keep arriving.
     """
     settings = rig.settings
     wrong = ""

@@ -2,10 +2,10 @@
 
 ``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. In most sequences, the hand
 grips the object. The soak then loads, turns and stops the grip, and disturbs it with faulty
-measurements. The daemon is complete except for its sockets. Requirements are checked with the
-plant's values and the data sent to the servos, not with the daemon's own reports. The soak counts
-how often each requirement is checked, and fails if a requirement is never checked. The test suite
-runs only a few sequences.
+measurements. The daemon is complete except for its sockets. The checks of the requirements use the
+plant's values and the data sent to the servos, not the daemon's own reports. The soak counts how
+often each requirement is checked, and fails if a requirement is never checked. The test suite runs
+only a few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time and records the stream.
 Violations are counted and do not end the run. The run fails if memory grows or a state is
@@ -62,14 +62,14 @@ SERVO_FAULTS = (
     *("silent", "gone", "deaf", "alert", "hot", "low", "fast", "stuck", "strayed"),
     *("jumped", "numb"),
 )
-# faults with which the joint angle contradicts the frames
+# faults that make the joint angle contradict the frames
 _ENCODER = ("fast", "strayed", "jumped", "numb")
-# faults with which a servo does not receive the torque-off command
+# faults that keep the torque-off command from reaching a servo
 _UNHEARD = ("silent", "gone", "deaf")
 _WATCHDOG = 100  # number of ticks until the servo watchdogs stop the motors (0.2 s)
 _LOST = 20  # number of consecutive lost goals that triggers a report
 SENSOR_FAULTS = ("no frames", "frozen", "full", "zero", "noise", "invalid")
-# For each measurement fault, the range of its values and the channel that the daemon may name.
+# For each measurement fault, the range of its values and the channel that the daemon may report.
 LIES = {
     "gain": ((0.5, 1.6), "sensor"),
     "shift-x": ((-4.0, 4.0), "sensor"),
@@ -84,10 +84,10 @@ _TOO_LONG = 0.05  # maximum time above a bound on the tip force [s]
 _TOO_MUCH = 1.3  # maximum ratio of a tip force to the requested force without a load
 _UNSURE = 1.2  # maximum ratio of a tip force to the raised grip force under a load
 _REMEMBERED = 5.0  # maximum time for which the grip force stays raised after a load or fault [s]
-_RETARGETED = 0.5  # maximum time for which the previously requested force may persist [s]
+_RETARGETED = 0.5  # maximum time until a newly requested force applies [s]
 _UNCOVERED = 1.0  # time for which a footprint outside the object excuses false reports [s]
 
-# Requirements. The test counts the checks of each requirement.
+# Requirements. The soak counts how often each requirement is checked.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
 OFF = "no torque after disarm or fault"
 WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
@@ -109,7 +109,7 @@ ASSERTIONS = (
 
 
 class Judge:
-    """Check requirements, and count the checks of each requirement.
+    """Check requirements, and count how often each requirement is checked.
 
     If ``broken`` is given, a violation is counted there and does not raise an exception.
     """
@@ -321,7 +321,7 @@ class Account:
     modes: Counter[str] = field(default_factory=Counter)  # number of ticks in each mode
     faults: Counter[str] = field(default_factory=Counter)  # number of latched faults by name
     injected: Counter[str] = field(default_factory=Counter)
-    # Channels that the daemon reported as faulty, each with the actual fault.
+    # Number of times the daemon reported each channel, by channel and actual fault.
     named: Counter[str] = field(default_factory=Counter)
     commands: Counter[str] = field(default_factory=Counter)  # accepted commands
     refused: int = 0
@@ -410,14 +410,14 @@ class Soak:
         self._next_disturbance = self._after(_DISTURBED_EVERY)
         self._well_at = math.inf  # tick at which a disturbance ends
         self._lie = ""  # kind of the current measurement fault
-        self._false: set[str] = set()  # faulty channels, which the daemon may name
+        self._false: set[str] = set()  # channels that the daemon may report as faulty
         self._loaded = 0.0  # N along the faces
         # Times [s] of the last load, the last wrong measurement, and the last footprint off the
         # object.
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
         # Requested forces [N] of the current grip, each with its time [s].
         self._asked: list[tuple[float, float]] = []
-        # Start of the current interval above the bound [s].
+        # Times [s] since which forces have exceeded their bounds.
         self._above = {MOST: math.inf, CALM: math.inf}
 
     def close(self) -> None:
@@ -494,7 +494,7 @@ class Soak:
         if name == "grasp" or (name == "hold" and ("force" in request or mode not in _GRIPPING)):
             force = request.get("force", self.settings.control.force_default)
             t = self.daemon.clock.now()
-            if not self._asked:  # A motion may already exert a higher force.
+            if not self._asked:  # The force may already be higher after a motion.
                 self._asked.append((t, max(self.hand.force.tolist())))
             self._asked.append((t, force))
         elif name in ("arm", "move", "release", "stop", "disarm"):
@@ -570,7 +570,7 @@ class Soak:
         self.hand.load()
 
     def _put_object_back(self) -> None:
-        """Put the object back if it has moved and the fingers leave room for it."""
+        """Put the object back if it has moved and no finger touches it."""
         hand, (x, y) = self.hand, self.settings.simulation.object_position
         pose = hand.object_pose.copy()
         if hand.force.any() or (math.dist(pose[:2], (x, y)) < 0.003 and abs(pose[2]) < 0.03):
@@ -642,7 +642,7 @@ class Soak:
         if self._lie or any(sensor.fault for sensor in self.sensors):
             self._lied_t = t
         force = max(self.hand.force.tolist())
-        # The measured force has the relative error of the torque constant.
+        # The relative error of the measured force is the error of the torque constant.
         self._must_end_soon(MOST, MOST, force, (1.0 + control.torque_error) * most, t)
         while len(self._asked) > 1 and self._asked[1][0] < t - _RETARGETED:
             del self._asked[0]
@@ -694,7 +694,7 @@ class Soak:
                 yield f"{side}_current"
 
     def _names(self, name: str) -> None:
-        """Check that a reported channel is faulty, unless a footprint has just left the object."""
+        """Check that the reported channel is faulty, unless a footprint just left the object."""
         t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1

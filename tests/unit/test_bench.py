@@ -187,7 +187,7 @@ def test_a_held_load_slides_and_a_lost_load_is_reported():
     assert 0.0 < held.answer < 0.022
     assert 0.0 < held.slid < 0.02
     assert not held.lost
-    # One joint still sticks and moves only a quarter as far as the other joint.
+    # One joint sticks, so it moves only a quarter as far as the other joint.
     sticking = reflex.overloaded({"simulation": {"object_mass": 0.5}}, 6.0, 15.0, 1)
     assert (sticking.answer < 0.022, sticking.slid < 0.012, sticking.lost) == (True, True, False)
     weak = {"control": {"grip_raise_max": 0.0}, "simulation": {"object_mass": 0.1}}

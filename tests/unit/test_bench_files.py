@@ -32,7 +32,7 @@ SETTINGS = Settings.model_validate(
 
 @pytest.fixture(scope="module")
 def tared() -> np.ndarray:
-    """Return contact pressures [Pa] with sensor noise around zero."""
+    """Return contact pressures [Pa] with zero-mean sensor noise."""
     grid = SensorGrid(44, 44, PITCH)
     clean = np.stack([grid.pressure(TIP, MATERIAL, d, 0.1 if d else 0.0, 0.0) for d in DEPTHS])
     return clean + np.random.default_rng(3).normal(0.0, NOISE, clean.shape)
@@ -470,7 +470,7 @@ def test_generators_differ():
     assert not any(same)
 
 
-# Checks before the first grip
+# Checks of files before the first grip
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,7 @@ def test_the_daemon_applies_the_file(bench, tmp_path):
         assert contact.tilt_y == pytest.approx(0.0, abs=0.01)
         assert contact.force == pytest.approx(math.pi * E * 0.003**2 / math.cos(0.15), rel=0.04)
         for perception in daemon.loop.perception.fingers:
-            perception.tare()  # The converter subtracts the new zero offset, in counts.
+            perception.tare()  # The tare replaces the zero offset [counts].
         daemon.loop.advance(0.3)
         assert daemon.loop.state.contacts[0].d == 0.0
 

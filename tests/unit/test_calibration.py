@@ -91,7 +91,7 @@ def test_the_curve_is_recovered_from_known_weights(kind):
     true = 0.9 * x**1.4 if kind == "power" else 60 * x + 0.08 * x**2 + 5e-5 * x**3
     depths = (0.001, 0.0015, 0.002, 0.003, 0.004)
     readings = [np.interp(GRID.pressure(TIP, LINEAR, d), true, x) for d in depths]
-    # The pressures exceed the range of the table, so use the exact inverse.
+    # The pressures exceed the interpolation table, so use the exact inverse.
     if kind == "power":
         readings = [(GRID.pressure(TIP, LINEAR, d) / 0.9) ** (1 / 1.4) for d in depths]
     found = fit_curve(kind, readings, [force(d) for d in depths], AREA, 4000.0)

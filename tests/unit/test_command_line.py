@@ -42,7 +42,7 @@ def test_the_closest_subcommand_is_suggested(inline):
         assert f"unknown word {word!r}; nearest: {near}" in wrong.stderr
     assert max(map(len, inline("limits").stdout.splitlines())) <= 120
     assert "unrecognized arguments: --zzz" in inline("run", "--zzz").stderr
-    # The message names the missing command and no options.
+    # The message lists only the missing command, not the options.
     assert inline("send").stderr.endswith("required: COMMAND\n")
 
 

@@ -129,7 +129,7 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
 
 
 def test_a_request_passes_few_functions(context, addresses):
-    """Count the daemon's functions that run between the socket and the handler."""
+    """Count the daemon's functions that run for one request, from the socket to the handler."""
     passed: set[str] = set()
     heard = []
 
@@ -201,7 +201,7 @@ def test_a_proxy_may_be_used(context, addresses):
         ([*[b"hop"] * (bounds.PART_COUNT_MAX - 3), b"", ARM], bounds.PART_COUNT_MAX - 2, True),
         ([*[b"hop"] * (bounds.PART_COUNT_MAX - 2), b"", ARM], 0, False),
         ([b"x" * 700, b"x" * 400, b"", ARM], 0, False),
-        ([b"", ARM, ARM], 1, False),  # A REQ socket would send two frames.
+        ([b"", ARM, ARM], 1, False),  # A REQ socket would send only two frames.
         ([b"id", ARM], 0, False),
         ([ARM, b""], 0, False),
         ([b"part"] * 500, 0, False),
@@ -295,7 +295,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         pass_time(clock, 0.5)
         until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
         assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
-        for _ in range(4):  # Wait until the gap is over.
+        for _ in range(4):  # Wait until the refusal time is over.
             pass_time(clock, bounds.REFUSAL_TIME / 2)
             served.serve(aged)
         if meanwhile == "signal":
@@ -326,7 +326,7 @@ def test_every_disarm_is_executed_even_with_the_same_key(context, addresses):
 
 
 def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses):
-    """After a gap, libzmq's thread may still deliver requests that were sent before a stop."""
+    """After a pause, libzmq's thread may still deliver requests sent before a stop."""
     clock, aged = VirtualClock(), Aged()
     with Served(commands=addresses[1], clock=clock) as served:
         served.link.fence()
@@ -489,7 +489,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             served.serve(note)
 
         until(lambda: [serve(), stopper.poll(0)][1])
-        # All requests before the stop receive a reply, but none of them is executed.
+        # Each request before the stop receives a reply but is not executed.
         replies: list[dict[str, Any]] = []
         until(lambda: [serve(), flood.collect(replies) == 160][1])
         assert order[carried_out:] == ["stop"]

@@ -81,7 +81,7 @@ def test_correlated_noise_increases_the_standard_deviation():
         return float(np.mean(np.square(errors)))
 
     smooth = found(np.full(8, 8**-0.5))
-    assert 0.3 < smooth < 3.0  # If the fit ignored correlation, the mean would be about 8.
+    assert 0.3 < smooth < 3.0  # A fit that ignored the correlation would give 8.
 
 
 def test_the_toe_region_is_excluded(monkeypatch):
@@ -122,7 +122,7 @@ def rubber(base: str) -> Force:
     with np.load(ROOT / "tests" / "golden" / "solid_frames.npz") as file:
         used = (file["base"] == base) & (file["theta"] == 0.0)
         d, push = file["d"][used], file["push"][used]
-    # In the limit d → 0, the contact is Hertzian.
+    # In the limit d → 0, the contact becomes a Hertz contact.
     curve = CubicSpline([0.0, *np.sqrt(d)], [4.0 / 3.0 / (1.0 - 0.49**2), *(push / d**1.5)])
     return lambda d, _: E * A**2 * float(curve(math.sqrt(d / A))) * (d / A) ** 1.5
 

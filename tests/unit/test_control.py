@@ -19,7 +19,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "simulation": {"tactile_delay": 0.040},
 }
 ANGLE = math.radians(10.0)
-# Relative uncertainty of the grip force after the torque measurements of one grip.
+# Relative uncertainty of the grip force once one grip's torque measurements are included.
 KNOWN = 0.06
 
 

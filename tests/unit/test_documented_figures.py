@@ -44,7 +44,7 @@ def test_tip_models_identified_from_finite_elements_match_the_page() -> None:
         assert best.tip.poisson - POISSON == pytest.approx(float(poisson_off), abs=0.002)
 
 
-_DRAW_COUNT = 3  # number of stored draws that are simulated again
+_DRAW_COUNT = 3  # number of stored random draws to simulate again
 
 
 @pytest.mark.extended

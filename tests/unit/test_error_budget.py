@@ -108,7 +108,7 @@ def pressed(tip, d, x, y, grid=FLAT):
 
 
 def unloading(tip: Fingertip, d: float, x: float, y: float, sign: float) -> np.ndarray:
-    """Return the pressures at ``d``, with errors of up to 10 % of the pressures at 1.3 d."""
+    """Return the pressures at ``d``, with errors of up to 10 % of each cell's pressure at 1.3 d."""
     loaded = np.maximum(pressed(tip, 1.3 * d, x, y), 1e-9)
     strain = np.clip(pressed(tip, d, x, y) / loaded, 0.0, 1.0)
     return pressed(tip, d, x, y) + sign * 0.4 * loaded * strain * (1.0 - strain)
@@ -129,7 +129,7 @@ def misplaced(by):
     return lambda tip, d, x, y, sign: pressed(tip, d, x, y, replace(FLAT, **by(sign)))
 
 
-# Sensor defects that the model does not include, each with the uncertainty that accounts for it.
+# Sensor defects that the model does not include, each with an uncertainty that covers the defect.
 IMPERFECTIONS = {
     "unloading": (Uncertainty(gain=0.1, smooth=0.04), unloading),
     "crosstalk": (Uncertainty(gain=0.02, smooth=0.01), crosstalk),
@@ -155,7 +155,7 @@ IMPERFECTIONS = {
 }
 
 
-# Defects that are harmless or make the frame invalid.
+# Defects that either are harmless or make the frame invalid.
 HARMLESS = ("gain", "springs"), ("slope", "solid"), ("baseline", "solid")
 
 

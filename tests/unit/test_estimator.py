@@ -41,7 +41,7 @@ def test_without_noise_the_bias_is_far_below_the_noise_level(material, free_gain
         assert e.valid
         n = 4 if free_gain else 3
         sigma = np.sqrt(np.diag(e.covariance))[:n]
-        # With other random values, the maximum ratio is 0.34.
+        # With other random seeds, the maximum ratio is 0.34.
         assert np.all(np.abs(errors(e, truth)[:n]) < 0.4 * sigma)
         assert abs(e.d - d) < 2e-3 * d
 

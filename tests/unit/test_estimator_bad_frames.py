@@ -26,7 +26,7 @@ def test_saturated_cells_are_excluded():
     assert abs(aware.d - 0.006) < 4.0 * aware.d_std
     assert aware.d_std > plain.d_std
     assert aware.cells < plain.cells
-    # The frames' type determines the full scale of an 8-bit board.
+    # For an 8-bit board, the data type of the frame determines the full scale.
     counts = np.minimum(np.round(clean / 300.0), 255).astype(np.uint8)
     assert counts.max() == 255
     board = ContactEstimator(TIP, LINEAR, GRID, 100.0)(counts, 300.0)

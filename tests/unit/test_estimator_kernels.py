@@ -42,7 +42,7 @@ def test_activity_matches_plain_numpy():
     rng = np.random.default_rng(12)
     weights = np.outer([1, 2, 2, 2, 1], [1, 2, 2, 2, 1]).astype(float)
     weights[2, 2] = 0.0
-    # Columns 2 to 21 and rows 2 to 17 are within reach.
+    # Only the cells in columns 2 to 21 and rows 2 to 17 can contain a contact.
     active = np.zeros((20, 24), bool)
     active[2:18, 2:22] = True
     state = EstimatorState()

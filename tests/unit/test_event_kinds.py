@@ -10,7 +10,7 @@ from softfinger.daemon.wire.event_kinds import KINDS
 
 ROOT = Path(softfinger.__file__).parents[1]
 LEVELS = ("info", "warning", "error")
-WARNS = {"_warn": "warning"}  # level of events from functions whose first argument is the kind
+WARNS = {"_warn": "warning"}  # functions that take the kind first, and their level
 
 
 def written(expression: ast.expr) -> str:
@@ -42,7 +42,7 @@ def test_every_kind_of_event_is_documented_with_its_levels():
     for folder in ("daemon", "tools/processes"):
         for file in (ROOT / folder).rglob("*.py"):
             for level, kind in emitted(file.read_text(encoding="utf-8")):
-                if kind.islower():  # The kind is a literal, not a constant of `safety.limits`.
+                if kind.islower():  # Skip constants from `safety.limits`.
                     levels.setdefault(kind, set()).add(level)
     levels["torque.off"].add("info")  # safety.torque_state uses a constant for the kind.
     assert {kind: set(each.levels.split(", ")) for kind, each in KINDS.items()} == levels

@@ -87,7 +87,7 @@ def test_double_integrals_equal_the_one_dimensional_form() -> None:
 def by_quadrature(
     d: float, theta: float, shear: float = 0.0, law: Material = LINEAR
 ) -> tuple[float, float]:
-    """Integrate F [N] and U [J] with SciPy; a shear moves the end of each spring along the face.
+    """Integrate F [N] and U [J] with SciPy; shear moves the ends of all springs along the face.
 
     Sheared springs have a constant modulus, and are equally stiff in all directions.
     """
@@ -161,8 +161,8 @@ def test_with_shear_the_minimum_is_before_upright(folder: Path) -> None:
     assert felt["least U [deg]"] == pytest.approx(
         minima["least U [deg]"][minima["share [%]"] == 5.0], abs=0.01
     )
-    # The plant's equilibrium includes the springs at the rim, which are sheared from their first
-    # contact.
+    # The plant's equilibrium includes the springs at the rim. These springs are sheared from their
+    # first contact on.
     balance = felt["least N cos theta + T sin theta [deg]"]
     assert (balance < minima["least F on the base [deg]"][minima["share [%]"] == 5.0]).all()
     model, plant = read(folder / "fig10_shear.csv"), read(folder / "fig10_shear_plant.csv")
@@ -259,7 +259,7 @@ def test_every_plot_is_complete_and_lists_its_errata(drawn: tuple[Path, list[Fig
                 assert (name, erratum.holds) in errata
             # The label contains a unit.
             assert all("[" in axes.get_xlabel() for axes in figure.axes[-1:])
-            # All text is inside the sheet.
+            # All text is within the page.
             box = figure.get_tightbbox()
             assert min(box.x0, box.y0) > -0.02
             assert max(box.x1 - page.size[0], box.y1 - page.size[1]) < 0.02
@@ -287,7 +287,7 @@ def test_without_matplotlib_only_the_values_are_written(tmp_path, capsys, monkey
 @pytest.fixture(scope="module")
 def rows() -> dict[str, PublishedValue]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(validate, "_TRIALS", 1)  # One trial takes a second.
+        patch.setattr(validate, "_TRIALS", 1)  # Each trial takes 1 s.
         return {each.quantity: each for each in validate.comparisons()}
 
 

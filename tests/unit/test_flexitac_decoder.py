@@ -47,7 +47,7 @@ def numbered(count: int, cells: int = CELLS, first: int = 0) -> list[bytes]:
 
 
 def balance(decoder: FlexiTacDecoder, fed: int) -> None:
-    """Check that every byte is in a frame, is counted as skipped, or is still buffered."""
+    """Check that every byte belongs to a frame, is counted as skipped, or is still buffered."""
     counters = decoder.counters()
     held = len(decoder._buffer)
     assert counters["frames"] * decoder.frame_bytes + counters["skipped_bytes"] + held == fed
@@ -147,7 +147,7 @@ def test_frames_do_not_depend_on_how_the_stream_is_split(images, start, cuts):
     start=st.integers(0, STRIDE),
 )
 def test_no_wrong_frame_for_any_images(images, start):
-    """Start anywhere in images that often contain AA 55; the decoder returns only sent frames."""
+    """Check that the decoder returns only frames that were sent, from any start in the stream."""
     # Append two frames that do not contain AA 55, because a constant image would remain ambiguous.
     images = [*images, *numbered(2)]
     stream = b"".join(frame(image) for image in images)[start:]

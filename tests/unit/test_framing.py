@@ -12,7 +12,7 @@ from softfinger.daemon.simulation.servo_model.framing import (
     frame,
 )
 
-# Most pieces occur in the header, because only the header's first bytes require byte stuffing.
+# Most of these byte sequences occur in packet headers, whose first bytes require byte stuffing.
 PIECES = [b"\xff\xff\xfd", b"\xff", b"\xfd", b"\x00", b"\x55", b"\x12"]
 payloads = st.lists(st.sampled_from(PIECES), max_size=40).map(b"".join)
 

@@ -59,7 +59,7 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        # This frame is longer than four requests.
+        # This frame exceeds the size of four requests.
         (zmq.DEALER, b"x" * (bounds.PART_SIZE_RATIO * 200 + 1)),
         # This subscription is longer than any topic.
         (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),

@@ -81,7 +81,7 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     q, d, angle = (0.12, 0.21), (3e-3, 4e-3), -0.1
     n, t, tips, v, rolls = faces(q, d, angle, taper)
     a = HAND.tip_radius
-    middle = tips.mean(axis=0)  # Any reference point on the object is suitable.
+    middle = tips.mean(axis=0)  # Any point can be the reference.
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
     arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
@@ -214,7 +214,7 @@ def test_torques_that_no_load_explains_give_a_finite_load(table):
             at = (table.data, table.data, (1e-6, 1e-3), (q, -0.1), 0.3, motion)
             left1, left2, lever, bow = load_torques(*at, (0.3, 0.3), (torque, 0.5))
             if lever == 0.0:
-                continue  # The load has no effect on the torques in this pose.
+                continue  # In this pose, the load does not affect torques.
             load, slope = load_of(0.5 * (left1 + left2), lever, bow)
             assert math.isfinite(load)
             assert slope > 0.0

@@ -142,7 +142,7 @@ def test_shaping_adds_the_increase_of_the_potential():
         env.reset(seed=1)
         start = env._potential
         sums.append(sum(env.step(np.ones(2, np.float32))[1] for _ in range(20)))
-    assert shaped._potential > start + 2.0  # The potential increases before contact.
+    assert shaped._potential > start + 2.0  # The potential also increases before contact.
     assert sums[1] - sums[0] == pytest.approx(shaped._potential - start)
     plain.close()
     shaped.close()

@@ -50,8 +50,7 @@ def test_quasi_static_steering_gain(degrees, gain):
     start = grasp.symmetric(0.004)
     place(hand, start.q, start.pose)
     hand.shear[:] = start.shear
-    # The joints are stiff and turn slowly, so only the joints and the tips' energy affect the
-    # motion.
+    # The joints are stiff and turn slowly, so the motion is quasi-static.
     parameters = hand.plant.parameters
     parameters.position_gain = 1e5
     parameters.rate_gain = parameters.current_limit = parameters.stall_current = 1e3
@@ -140,13 +139,13 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
             energy = later
             if hand.t > 0.15:
                 highest = max(highest, np.abs(hand.object_velocity[1]))
-        # The object lies flat, so two corner springs of 1e5 N/m carry its weight. A tip that
-        # touches the object may still creep.
+        # The object lies flat, so two corner springs of 1e5 N/m carry its weight. A tip may still
+        # touch the object and creep.
         half = 0.5 * (0.060 if abs(math.sin(hand.object_pose[2])) < 0.5 else 0.040)
         sunk = 0.1 * 9.80665 / 2e5
         assert hand.object_pose[1] == pytest.approx(0.01 + half - sunk, abs=5e-7)
         assert np.abs(hand.object_velocity[1:]).max() < 1e-6
-    assert highest > 0.01  # The tilted object rocked before it came to rest.
+    assert highest > 0.01  # The object rocked before it came to rest.
 
 
 def test_a_collision_conserves_momentum_and_energy():

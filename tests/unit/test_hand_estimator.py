@@ -154,7 +154,7 @@ def test_a_contact_at_start_up_is_reported_from_the_first_frame_on(estimator, re
     contacts, pose = [Contact(), Contact()], ObjectPose()
     if read_first:
         estimator.predict(Reading(t=5.0, q=[0.15, 0.15], valid=True))
-    # The sensor sampled both frames before the first reading of the joints.
+    # Both frames were sampled before the first reading of the joints.
     for k in range(2):
         estimator.update(0, frame(4.98 + 0.01 * k), ESTIMATE, contacts[0])
         estimator.write_contacts(5.0, contacts, pose)
@@ -200,7 +200,7 @@ def test_joint_motion_compensates_for_slow_cells(response):
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15
-    # Distances below the tip's apex [m], with equal steps in area.
+    # Distances of the cells below the tip's apex [m]. All cells have the same area.
     below = np.linspace(0.0, 0.01, 400)
     pressure, shown, fitted = np.maximum(d - below, 0.0), q, (d, 1.0)
     follows = -math.expm1(-0.002 / response)

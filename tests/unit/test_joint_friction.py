@@ -26,7 +26,7 @@ def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
 
 
 def load(hand: SimulatedHand, torques: Iterable[float], each: float) -> np.ndarray:
-    """Apply motor torques [N·m] for ``each`` [s], one by one; return the angle after each."""
+    """Apply each motor torque [N·m] for ``each`` [s]; return the joint angle after each torque."""
     found = []
     for torque in torques:
         hand.drive(0, CURRENT, True, 0.0, torque / CONSTANT)
@@ -84,7 +84,7 @@ def test_break_away_is_at_the_static_friction_torque():
     angles = load(hand, torques, 0.005)
     slipped = torques[np.argmax(angles > 1.05 * PRESLIDING)]
     assert slipped == pytest.approx(FRICTION + stribeck, rel=0.01)
-    # The additional static friction disappears, so the joint accelerates.
+    # Once the joint slips, the additional static friction disappears, so the joint accelerates.
     assert angles[-1] > 100 * PRESLIDING
 
 
@@ -106,7 +106,7 @@ def test_friction_reverses_over_twice_the_presliding_distance():
     closing, opening = torque[turn - 200 : turn].mean(), torque[-200:].mean()
     assert closing == pytest.approx(FRICTION, rel=0.01)
     assert closing - opening == pytest.approx(2.0 * FRICTION, rel=0.01)
-    # The transition is a straight line, whose slope depends on the presliding distance.
+    # The transition is a straight line with the slope friction / presliding distance.
     within = slice(turn + 20, turn + 80)
     slope, _ = np.polyfit(angle[within], torque[within], 1)
     assert slope == pytest.approx(FRICTION / PRESLIDING, rel=0.02)
@@ -135,7 +135,7 @@ def test_a_friction_level_that_changes_at_standstill_adds_no_torque():
     hand.plant.state.bristles[0] = 0.6 * PRESLIDING
 
     def torque(motor: float) -> float:
-        load(hand, [motor], 0.02)  # This time is longer than the motor's time constant.
+        load(hand, [motor], 0.02)  # long compared with the motor's time constant
         gears = hand.plant.gears[0]
         assert gears.friction == pytest.approx(FRICTION + share * motor, rel=1e-6)
         return gears.friction * gears.limited_deflection / PRESLIDING

@@ -27,9 +27,8 @@ class Joint:
         self.random = random.Random(seed)
 
     def tick(self, dq: float, lag: float = 0.02, held: float = 0.0) -> int:
-        """Move at ``dq`` [rad/s] for a tick; the reported velocity follows within ``lag`` [s].
-
-        The loop receives the reply ``held`` [s] late.
+        """Move at ``dq`` [rad/s] for a tick; the loop receives the servo's reply ``held`` [s] late.
+        The reported velocity has the time constant ``lag`` [s].
         """
         self.t += TICK
         self.q += dq * TICK
@@ -105,7 +104,7 @@ def test_a_jump_during_lost_readings_is_detected():
 
 
 def spoil(daemon: Daemon, how: Callable[[Reading], None]) -> None:
-    """Corrupt each later reading with ``how``."""
+    """Corrupt all later readings with the function ``how``."""
     servos = daemon.loop.torque.servos
     really = servos.read
 
@@ -146,7 +145,7 @@ def test_a_joint_fault_ends_a_grip(make, how, name, within):
 
 @pytest.mark.parametrize(("ticks_with_torque", "fault"), [(0, ""), (3, "joint.jump")])
 def test_only_readings_with_torque_on_are_compared(make, ticks_with_torque, fault):
-    """While torque is off, an emulated hand does not wait for the daemon, so readings may jump."""
+    """With torque off, an emulated hand does not wait for the daemon, so readings may jump."""
     daemon = make()
     daemon.loop.advance(0.1)
     if ticks_with_torque:

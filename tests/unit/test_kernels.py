@@ -105,7 +105,7 @@ def test_an_unknown_field_is_an_error():
 
 
 def test_array_aliases_of_every_numpy_version_are_recognised():
-    # NumPy 2.5 defines NDArray[np.float64] as this alias.
+    # In NumPy 2.5, NDArray[np.float64] is this alias.
     of_2_5 = types.GenericAlias(np.ndarray, (np.float64,))
     for alias in (NDArray[np.float64], of_2_5):
         assert _kind(Annotated[alias, 3]) == (None, np.float64, (3,))

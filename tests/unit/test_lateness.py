@@ -1,4 +1,4 @@
-"""Test how delays of the machine affect clocks, simulated hands, real hands and messages."""
+"""Test how a machine's delays affect clocks, simulated hands, real hands and messages."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -45,7 +45,7 @@ def on_late_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[Build]:
 
 
 def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
-    """Run ``count`` ticks; return the state without the values that depend on the machine."""
+    """Run ``count`` ticks; return the state without machine-dependent values."""
     loop = daemon.loop
 
     def end_in_time(_: float) -> None:
@@ -173,7 +173,7 @@ METAL = Settings.model_validate({"servos": {"backend": "dynamixel"}})
 
 
 def looked(late: float, seconds: float) -> list[tuple[str, str, str]]:
-    """Return the events for a real hand if every tick exceeds its period by ``late`` [s]."""
+    """Return a real hand's events if every tick takes ``late`` [s] longer than its period."""
     timing = Timing(tick_s=0.002 + late)
     lateness = Lateness(METAL, timing, waits=False)
     ticks = round(seconds / 0.002)
@@ -204,7 +204,7 @@ def test_the_time_of_a_hand_is_constant_between_sleeps_and_ends_them_on_time():
     assert clock.sleep_until(100.002) == pytest.approx(0.0015)
     assert clock.now() == 100.002
     assert clock.host() == pytest.approx(100.0035)
-    clock.sleep_until(100.004)  # The delay shortens this wait.
+    clock.sleep_until(100.004)  # The wait is shorter by the delay.
     assert (clock.now(), clock.host()) == (100.004, 100.004)
     assert clock.behind == 0.0
 

@@ -130,7 +130,7 @@ def test_a_short_spike_of_a_condition_that_must_last_is_not_a_fault():
     [THINNER, *(FAULTS[each][0] for each in ("current", "stalled", "dead", "brown-out"))],
 )
 def test_checking_for_a_cause_does_not_change_the_result(changes):
-    """Checking for a fault's cause, as commands do, must not change when the fault is detected."""
+    """When a command checks for the cause of a fault, this check must not delay the fault."""
     asked, alone, state = safety(), safety(), sound()
     for k in range(1500):
         if k == 100:
@@ -177,7 +177,7 @@ def test_fingers_that_disagree_on_the_object_angle_warn_and_then_fault() -> None
     name, text = judged(judge, state, 0.5)
     assert name == "hand.angle"
     assert "differ by 12.0°: check the joints' zeros" in text
-    right.estimate.covariance[1, 1] = 0.06**2  # The estimate is now too uncertain for a fault.
+    right.estimate.covariance[1, 1] = 0.06**2  # With this uncertainty, 12° is not a fault.
     assert judged(judge, state, 0.5) == ("", "")
 
 
@@ -227,7 +227,7 @@ def test_a_warning_is_reported_once_until_it_has_ended(name):
 
 @pytest.mark.parametrize(("good", "told"), [(1000, True), (20, True), (3, False)])
 def test_readings_that_fail_for_a_second_are_reported_even_while_disarmed(good, told):
-    """One in ``good`` readings is valid."""
+    """Out of ``good`` readings, one is valid."""
     watch, state = safety(), sound(Mode.DISARMED)
     state.torque = False
     first = math.inf
@@ -335,7 +335,7 @@ def test_saturated_cells_are_reported():
     ]
 
 
-# Path and limit of each value that may reach a fraction of its limit. Ages are relative to the
+# For each limit, the path of the checked value and the value of the limit. Ages are relative to the
 # current time.
 PUSHES: dict[str, tuple[str, float]] = {
     "joint.angle": ("reading.q.{}", SETTINGS.hand.q_max[0] + 0.1),

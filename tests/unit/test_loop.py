@@ -178,7 +178,7 @@ def test_the_state_contains_the_goals_of_the_grip(make):
     daemon.loop.advance(0.01)
     message = state_message(daemon.loop.state, parts(daemon.settings))
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
-    # Under this load, the tips would slip at the requested force, so the force increases.
+    # With the requested force, the tips would slip under this load, so the force increases.
     for k in range(1, 101):
         daemon.hand.apply_load(0.0, 0.12 * k, 0.0)
         daemon.loop.advance(0.02)
@@ -243,7 +243,7 @@ def test_a_tare_reports_the_change_of_the_zero(make):
         f"the left sensor's zero offsets changed: median +30.0 counts ({30 * pascal:+.0f} Pa), "
         "largest change +80.0 counts"
     )
-    # The warning gives the change from the last zero offset, not from the first zero offset.
+    # The warning states the change since the last tare, not since the first tare.
     assert tared(-10, -60).endswith("largest change -150.0 counts")
 
 

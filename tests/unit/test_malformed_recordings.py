@@ -52,7 +52,7 @@ def settings_message() -> dict[str, Any]:
 
 
 def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
-    """Write a recording of ten frames; if ``spoil`` is given, corrupt one of them."""
+    """Write a recording of ten frames; if ``spoil`` is given, corrupt one frame."""
     writer = RecordingWriter(path)
     writer.add(schema.SETTINGS, settings_message())
     for k in range(10):

@@ -62,7 +62,7 @@ def test_a_law_is_smooth_increasing_and_consistent(index):
     inner = STRAIN[:-1, None] + 0.5 * (points + 1) * np.diff(STRAIN)[:, None]
     parts = 0.5 * np.diff(STRAIN) * (material.stress(inner) * weights).sum(axis=1)
     np.testing.assert_allclose(energy[1:], np.cumsum(parts), rtol=1e-12)
-    # Evaluate the exact polynomial term by term.
+    # Evaluate the polynomial exactly, term by term.
     powers = [float(c) for c in material.coefficients]
     for strain in (1e-9, 0.124999, 0.125, 0.3, 0.75, 1.0 - 1e-12):
         exact = math.fsum(c * strain**j for j, c in enumerate(powers, 1))
@@ -145,7 +145,8 @@ def test_the_force_error_equals_the_effect_of_the_misfit_on_the_force():
     x = np.linspace(0.025, 1.0, 40)
     curve = 1e5 * x**0.7
     law = Material.from_points(x, curve)
-    # Compare F = 2π h² ∫ σ/(1 − ε)³ dε of an upright tip for the measured curve and for the law.
+    # Compare the force of an upright tip, F = 2π h² ∫ σ/(1 − ε)³ dε, for the measured curve and for
+    # the law.
     for share in (0.05, 0.1, 0.3):
         strain = share * (np.arange(2000) + 0.5) / 2000
         weight = (1.0 - strain) ** -3

@@ -35,7 +35,7 @@ def golden() -> Iterator[Any]:
 def rewritten(
     path: Path, profile: str = "", others: bool = False, ids: int = 1, prefix: str = "", **options
 ) -> Path:
-    """Rewrite the golden recording with ``ids`` channels per topic and, if wanted, other topics."""
+    """Rewrite the golden recording with ``ids`` channels per topic; ``others`` adds other topics."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start(profile, "merged")
@@ -96,7 +96,7 @@ def test_all_variants_of_the_format_give_the_same_recording(tmp_path, options):
     assert recording.total == SHORT
     assert recording.count(schema.STATE) == sum(topic == schema.STATE for topic, _ in wanted)
     times = [message.log_time * 1e-9 for _, _, message in golden()]
-    # The camera's start time has no effect.
+    # The camera's earlier start has no effect.
     assert recording.start == pytest.approx(min(times) + 1e4)
     assert recording.duration == pytest.approx(max(times) - min(times))
     late = list(recording.messages([schema.STATE], start=0.1))

@@ -40,7 +40,7 @@ WEIRD = 1e6  # stiffness [N/m²] of the force WEIRD d^1.8 A^0.2 cos θ, which no
 
 
 def weird(d: float, theta: float) -> np.ndarray:
-    """Return the pressure of a tip that no model fits, which has a blunt peak.
+    """Return the pressures of a tip that no model fits. The pressures have a blunt peak.
 
     When the tip tilts, the peak moves half as far as the peak of a spring tip.
     """

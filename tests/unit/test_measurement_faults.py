@@ -50,7 +50,7 @@ class Press:
         return found
 
     def pressed(self, count: int) -> list[np.ndarray]:
-        """Return the given number of frames that follow after 1.4 s of compression."""
+        """Compress the tip for 1.4 s, then return the given number of frames."""
         self.clock.sleep_until(1.4)
         self.sensor.latest()
         return self.frames(count)
@@ -92,7 +92,7 @@ def test_faults_develop_linearly_over_their_duration_and_end():
     assert [faults("gain", t) for t in (0.0, 3.0, 4.0, 4.5, 5.0, 9.0)] == [
         *(1.0, 1.0, 0.75, 0.625, 0.5, 0.5)
     ]
-    faults.begin("gain", 2.625, 4.5, 4.0)  # The ramp starts from the current value.
+    faults.begin("gain", 2.625, 4.5, 4.0)  # This ramp starts from the present value.
     assert [faults("gain", t) for t in (4.5, 6.5, 8.5)] == [0.625, 1.625, 2.625]
     faults.begin("drift", 0.1, 7.0)
     assert [faults("drift", t) for t in (6.999, 7.0)] == [0.0, 0.1]
@@ -122,7 +122,8 @@ def test_frames_are_repeated_with_new_numbers():
     assert len({each.tobytes() for each in kept}) == 20
     press.faults.begin("replay", 0.06, press.clock.now())
     again = press.frames(18)
-    # The sensor delivers each frame one period late, so the first frame is from before the fault.
+    # The sensor delivers each frame one period late, so the first frame was measured before the
+    # fault.
     last = [*kept, again[0]][-6:]
     assert [each.tobytes() for each in again[1:]] == [
         last[k % 6].tobytes() for k in range(len(again) - 1)

@@ -286,10 +286,10 @@ def test_key_sequences():
     ]
     assert keys.decode(b"\x1b") == []
     assert keys.decode(b"[") == []
-    assert keys.decode(b"D") == ["left"]  # Three reads complete one sequence.
+    assert keys.decode(b"D") == ["left"]  # Three reads together form one key sequence.
     keys.decode(b"\x1b")
     keys.settle()
-    assert keys.decode(b"g") == ["g"]  # A single Escape does not affect the next key.
+    assert keys.decode(b"g") == ["g"]  # An earlier Escape does not affect this key.
     assert keys.decode(b"a\x1b[200~go") == ["a"]
     assert keys.decode(b"go\x1b[20") == []
     assert keys.decode(b"1~q") == ["q"]
@@ -300,7 +300,8 @@ def test_resampling_equals_the_area_average():
     blocks = grid.reshape(22, 2, 11, 4).mean(axis=(1, 3))
     assert resample(grid, 22, 11) == pytest.approx(blocks, abs=1e-12)
     assert resample(grid, 88, 132) == pytest.approx(np.kron(grid, np.ones((2, 3))), abs=1e-12)
-    # If one size does not divide the other, the reference uses a finer grid that both sizes divide.
+    # If one size is not a multiple of the other, the reference uses a finer grid, whose size is a
+    # multiple of both.
     fine = np.kron(grid, np.ones((17, 9)))
     twin = fine.reshape(17, 44, 9, 44).mean(axis=(1, 3))
     assert resample(grid, 17, 9) == pytest.approx(twin, abs=1e-12)

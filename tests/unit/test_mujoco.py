@@ -34,7 +34,7 @@ FREE = '<joint axis="0 1 0"/><joint axis="0 0 1"/>'
 def scene(
     tilt: float = 0.0, joints: str = "", integrator: str = "implicitfast", radius: float = RADIUS
 ) -> tuple[Any, Any]:
-    """Return a model and data; the tip just touches a face that is tilted by ``tilt`` [rad]."""
+    """Return a model and data, in which the tip just touches a face tilted by ``tilt`` [rad]."""
     away = RADIUS + 0.05
     place = {"x": away * math.cos(tilt), "y": away * math.sin(tilt), "degrees": math.degrees(tilt)}
     text = SCENE.format(joints=joints, integrator=integrator, radius=radius, **place)
@@ -73,7 +73,7 @@ def test_friction_is_a_cone_including_the_lateral_direction(used):
         bears = 2.0 * float(tips.table(d, 0.0).force) / d
         assert slid == pytest.approx(push / bears, rel=1e-3)
         assert data.qpos[2] / data.qpos[1] == pytest.approx(4.0 / 3.0, rel=1e-3)
-    else:  # The rest of the push moves the face, which has a damping of 5 N·s/m.
+    else:  # The remaining push moves the face against 5 N·s/m.
         speed = (push - FRICTION * press) / 5.0
         assert math.hypot(*data.qvel[1:]) == pytest.approx(speed, rel=0.01)
 

@@ -114,7 +114,7 @@ def test_a_declared_sheet_is_not_mistaken_for_a_missing_object():
 
 
 def test_a_small_disc_is_not_mistaken_for_another_tip():
-    """A disc causes a misfit, whose effect on d could exceed half of d."""
+    """A disc causes a misfit, which could change d by more than half."""
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
         rig.grasp(8.0)
         assert rig.state.mode == "holding"
@@ -133,5 +133,5 @@ def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts():
         line = math.atan2(*(tips[1] - tips[0])[::-1])
         # If the contact is curved, the estimated tilt is slightly too small.
         assert rig.state.object.angle == pytest.approx(0.95 * line, abs=0.01)
-        # The disc has also rolled on the tips.
+        # In addition, the disc has rolled on the tips.
         assert rig.plant.object_pose[2] > 2.0 * line

@@ -24,7 +24,7 @@ STRANGER = 54321
 
 @pytest.fixture
 def strangers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
-    """Return a function that makes a file belong to another user, or appear to do so."""
+    """Return a function that makes another user the owner of a file, or pretends to."""
 
     def give(path: Path) -> None:
         if os.geteuid() == 0:

@@ -117,7 +117,7 @@ def test_bristles_carry_shear_at_any_tilt_with_the_normal_force_of_the_springs(t
 @pytest.mark.parametrize("trial", range(24))
 def test_energy_never_increases_without_input(trial):
     # Scenes, masses, moduli, friction and the initial motion are random. In some trials, a contact
-    # is beyond the rim. One trial in three uses a time step that is ten times too long.
+    # extends beyond the tip's rim. One trial in three uses a time step that is ten times too long.
     generator = np.random.default_rng(trial)
     hand = random_hand(generator, trial % 3 == 0)
     held = hand.plant.parameters.object_held
@@ -187,9 +187,9 @@ def test_creep_relaxes_a_stuck_shear_exponentially():
 
 
 def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
-    # The expected T/(μN) results from the friction of all springs. During the first loading, the
-    # ratio is 1 − (1 − u/μd)². After a reversal, the ratio changes by twice this function of half
-    # the distance. A closed path restores the initial force.
+    # The expected T/(μN) is derived from the friction of all springs. During the first loading, the
+    # ratio is 1 − (1 − u/μd)². After a reversal, the change of the ratio is twice this function,
+    # evaluated at half the distance. A closed path restores the initial force.
     def virgin(u: float) -> float:
         return 1.0 - (1.0 - min(u / (MU * DEPTH), 1.0)) ** 2
 
@@ -198,7 +198,7 @@ def test_slip_starts_at_the_edge_and_is_stored_layer_by_layer() -> None:
     assert out == pytest.approx(virgin(part), abs=0.01)
     assert turned == pytest.approx(out - 2.0 * virgin(0.5 * (part - back)), abs=0.01)
     assert again == pytest.approx(out, abs=1e-3)
-    # Oscillations of decreasing amplitude remove the shear.
+    # An oscillation with decreasing amplitude removes the shear.
     fading = [part * (-1.0) ** k * (1.0 - k / 30.0) for k in range(31)]
     (*_, left) = sheared(pressed(tip_micro_slip=True), fading)
     assert abs(left) < 0.05 * out

@@ -1,6 +1,6 @@
 """Test the plant and its order of convergence against SciPy's adaptive solver.
 
-The smooth equations of motion are implemented independently in plain NumPy. The equations assume a
+The equations of motion are implemented independently, in plain NumPy. The equations assume a
 constant modulus, sticking tips, and damping only in the tips and the palm. The contacts are
 functions of the coordinates (q1, q2, x, y, φ), whose derivatives are computed by complex steps. The
 forces are derived from the closed form of the tips' energy.
@@ -88,7 +88,7 @@ def material(x, finger, point):
 
 
 def on_face(finger, point, angle):
-    """Return the contact with a plane face through ``point``; the inward normal is at ``angle``."""
+    """Return the contact with a flat face through ``point`` with the inward normal at ``angle``."""
 
     def normal(x):
         return np.array([np.cos(x[4] + angle), np.sin(x[4] + angle)])
@@ -141,7 +141,7 @@ def each_other():
 
 @dataclass
 class Equations:
-    """Equations of motion for five coordinates, and one shear for each contact and palm point."""
+    """Equations of motion for five coordinates and for the shears of contacts and palm points."""
 
     contacts: list
     inertias: np.ndarray
@@ -196,7 +196,7 @@ CORNERS = np.array([[-0.020, -0.030], [0.020, -0.030]])
 
 @dataclass
 class Scene:
-    """Start and settings of a motion during which all contacts persist and stick."""
+    """Initial state and settings of a motion during which all contacts persist and stick."""
 
     contacts: list
     simulation: dict = field(default_factory=dict)
@@ -278,7 +278,7 @@ def test_second_order_agreement_with_an_adaptive_solver(name, loss):
         hand = start(scene, loss, count)
         hand.advance(hand.t + SECONDS)
         errors.append(np.abs((compared(hand, scene) - exact) / scale).max())
-        # The motion is smooth, so errors are due to the integration method.
+        # The motion is smooth, so all errors are due to the integration method.
         assert hand.plant.limited_step_count == 0
         assert hand.d.min() > 0.001
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)

@@ -136,7 +136,7 @@ def test_curvature_softens_the_contact_like_the_springs(curved, upright, tilted)
         assert springs_on_a_cylinder(d, math.radians(30), curved) == pytest.approx(
             (share,) * 2, rel=tilted
         )
-    # For small d, the share is exact.
+    # In the limit of small d, the share is exact.
     assert springs_on_a_cylinder(1e-4, 0.3, curved) == pytest.approx((share,) * 2, rel=1e-3)
 
 
@@ -197,8 +197,8 @@ def test_an_object_slides_on_the_palm_with_coulomb_friction(scene):
     assert hand.object_velocity[0] == pytest.approx(0.3 - friction * GRAVITY * 0.03, rel=0.02)
     assert hand.object_velocity[2] == pytest.approx(spin, rel=0.05, abs=0.3)
     run(hand, 0.17)
-    # The rectangle stops after a distance of v²/(2μg). The disc rolls at two thirds of the initial
-    # velocity.
+    # The rectangle slides for v²/(2μg) and stops. The disc finally rolls at two thirds of its
+    # initial velocity.
     rolling = 0.0 if scene == "rectangle" else 0.3 * 2 / 3
     assert hand.object_velocity[0] == pytest.approx(rolling, abs=2e-3)
     assert hand.object_velocity[2] * 0.03 == pytest.approx(-rolling, abs=2e-3)

@@ -47,7 +47,7 @@ def test_the_true_tip_model_fits_best(tip):
     assert best.valid == 1.0
     assert best.d_error < 1e-4
     assert best.theta_error < math.radians(1.5)
-    assert best.force_error < 0.12  # Most of the error is the noise of the summed pressure.
+    assert best.force_error < 0.12  # mostly noise of the summed pressure
     if tip.physics == "solid":
         assert (best.tip.base, best.tip.face) == ("bonded", "sticking")
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)

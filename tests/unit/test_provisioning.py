@@ -56,14 +56,13 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
             [servo(1, 57600), servo(2, 57600)],
             ["0: 57600 → 2000000 baud", "1: 57600 → 2000000 baud"],
         ),
-        # If one servo is missing and one servo is unexpected, the unexpected servo is the missing
-        # servo.
+        # If one servo is missing and another servo is unexpected, the search identifies the
+        # unexpected servo as the missing one.
         (BOTH, [servo(1), servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
         (BOTH, [servo(1), servo(7)], ["1: ID 7 → 2"]),
         (OTHER_IDS, [servo(1, 57600)], ["0: ID 1 → 11, 57600 → 2000000 baud"]),
-        # A servo with the ID of a finger outside the scene cannot be the missing servo. A servo
-        # with the factory ID and baud rate may belong to any finger, so it can be the missing
-        # servo.
+        # A servo cannot be the missing servo if it has the ID of a finger that is not in the scene.
+        # A servo with the factory ID and baud rate may belong to any finger.
         (ONLY_LEFT, [servo(2)], ["missing 0", "stranger 2@2000000"]),
         (ONLY_RIGHT, [servo(1)], ["missing 1", "stranger 1@2000000"]),
         (ONLY_RIGHT, [servo(1, 57600)], ["1: ID 1 → 2, 57600 → 2000000 baud"]),
@@ -82,8 +81,8 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         ),
         # An emulator without line timing replies at every baud rate.
         (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
-        # A servo with garbled replies is not configured, and its ID is not assigned to another
-        # servo.
+        # If a servo's replies are garbled, the servo is not configured, and its ID is not assigned
+        # to another servo.
         (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),
         (
             BOTH,
@@ -134,7 +133,7 @@ class Bus:
 
 @pytest.fixture
 def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
-    """Return a function that creates the bus behind the line that the test opens."""
+    """Return a function that creates a bus and connects it to the line that the test opens."""
 
     def make(**options: Any) -> Bus:
         bus = Bus(**options)

@@ -1,4 +1,4 @@
-"""Test publication rates; test loop-time histograms against NumPy and for memory allocation."""
+"""Test publication rates, and the quantiles and memory allocation of loop-time histograms."""
 
 import math
 import tracemalloc
@@ -101,7 +101,7 @@ def test_quantiles_match_the_samples_within_one_bin(count):
     for j, name in enumerate(TIMES):
         for share, told in zip(QUANTILES, spreads[name], strict=False):
             true = np.quantile(rows[:, j], share, method="inverted_cdf")
-            if true < 2.0**-30:  # All times below a nanosecond are in one bin.
+            if true < 2.0**-30:  # One bin holds all times below 1 ns.
                 assert told <= 2.0**-29, (name, share)
             else:
                 assert true * (1 - 1e-12) <= told <= true * (1 + 1 / 31), (name, share)

@@ -105,7 +105,7 @@ def test_more_nodes_do_not_change_the_result(depth, share):
 )
 @settings(max_examples=60)
 def test_every_admissible_material_has_its_minimum_energy_upright(slopes, depth, share):
-    """Use random positive Bernstein polynomials as tangent moduli; laws may stiffen or soften."""
+    """Draw the tangent modulus as a random positive Bernstein polynomial."""
     n = len(slopes) - 1
     modulus = np.polynomial.Polynomial([0.0])
     for k, slope in enumerate(slopes):
@@ -135,7 +135,8 @@ def test_values_outside_the_domain():
 radii = st.floats(1e-4, 1.0)
 moduli = st.floats(1.0, 1e9)
 fractions = st.floats(5e-8, 0.9999)  # fraction of the radius
-# Fraction of the limit of θ. A tilt close to the denormal numbers has no relative precision.
+# Fraction of the limit of θ. Tilts below 1e-150 become 0, because denormal numbers have no relative
+# precision.
 shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-150 else 0.0)
 
 

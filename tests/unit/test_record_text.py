@@ -1,4 +1,4 @@
-"""Test the texts and pictures that represent stream records at a prompt and in a notebook."""
+"""Test the text and pictures that display stream records at a prompt and in a notebook."""
 
 import re
 from typing import Any

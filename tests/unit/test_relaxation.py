@@ -1,4 +1,4 @@
-"""Test tip relaxation in the plant against integrals of the Prony terms, and its energy decay."""
+"""Test the plant's tip relaxation and energy decay against integrals of the Prony terms."""
 
 import re
 from pathlib import Path
@@ -100,7 +100,7 @@ def test_relaxing_tips_do_not_generate_energy():
 
 @pytest.mark.parametrize("strengths", [(0.0, 0.15, 0.25), (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)])
 def test_press_and_hold_gives_the_strengths(strengths):
-    """Noisy frames at 100 Hz, from a separate ODE, cannot resolve the shortest time constant."""
+    """Fit a noisy force, sampled too slowly (100 Hz) to resolve the shortest time constant."""
     t = np.arange(-1.0, 6.0, 0.01)
     lasting = 12.0 * np.clip(t / 0.1, 0.0, 1.0) ** 1.6
 
@@ -127,7 +127,7 @@ def test_too_short_a_hold_is_refused():
 
 
 def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
-    """Hold with 8 N; return the relative true force after 1 s and at the end, and the warnings."""
+    """Hold with 8 N; return the relative true forces after 1 s and at the end, and all warnings."""
     sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
     sections.setdefault("simulation", {})["tip_relaxation"] = STRENGTHS
     if aware:

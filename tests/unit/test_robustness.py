@@ -88,7 +88,7 @@ def test_equal_seeds_give_equal_hands():
 
 
 def frames(zero: float, cells: int = 32, pressed: int = 200) -> np.ndarray:
-    """Return the counts of a 20 mm tip that is indented by 3 mm, plus a zero offset."""
+    """Return the counts for a 20 mm tip with an indentation of 3 mm, plus a zero offset."""
     at = (np.arange(cells) - 0.5 * (cells - 1)) * 0.058 / cells
     inside = np.hypot(*np.meshgrid(at, at)) < 10.5e-3
     return np.where(inside, pressed + zero, zero).astype(np.uint16)

@@ -39,7 +39,7 @@ def bounded(judge: Safety, state: State, wanted: Goal) -> Goal:
 
 def test_goals_are_bounded_by_joint_and_current_limits():
     judge, state = safety(), sound()
-    for _ in range(1000):  # 1000 ticks are enough for the step and the slew.
+    for _ in range(1000):  # Within 1000 ticks, the goals reach both limits.
         found = bounded(judge, state, goal((9.0, -9.0), (5.0, -0.2)))
     assert found.valid
     assert found.q == [SETTINGS.hand.q_max[0], SETTINGS.hand.q_min[1]]
@@ -78,7 +78,7 @@ def test_a_goal_current_increases_slowly_and_decreases_immediately():
     for k in (1, 2, 3):
         assert bounded(judge, state, goal((0, 0), (0.5, 0.0))).current[0] == pytest.approx(k * rise)
     assert bounded(judge, state, goal((0, 0), (0.05, 0.0))).current[0] == 0.05
-    state.seq += 5  # Torque was off in between.
+    state.seq += 5  # Skipped ticks mean that torque was off.
     assert bounded(judge, state, goal((0, 0), (0.5, 0.0))).current[0] == pytest.approx(rise)
 
 

@@ -91,7 +91,7 @@ def test_hysteresis_affects_only_unloading_and_loops_close():
     assert force(0.0038) > 1.03
     assert force(0.002) == pytest.approx(1.1, abs=0.005)
     assert 1.0 < force(0.0021) < 1.07  # loading within the hysteresis loop
-    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # The hysteresis loop is closed.
+    assert force(0.004) == pytest.approx(1.0, abs=1e-3)  # The loop closes at the maximum d.
     assert force(0.006) == pytest.approx(1.0, abs=1e-9)
     assert not counts(model, (0.0, 0.0, 0.0)).any()
 

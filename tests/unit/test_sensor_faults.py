@@ -195,7 +195,7 @@ def test_real_loads_and_turns_are_not_measurement_faults(load: tuple[float, floa
 
 
 def given(repeats: RepeatDetector, frames: list[float]) -> bool:
-    for number in frames:  # Only one cell increases by 10 %.
+    for number in frames:  # Only the last cell resolves tenths.
         repeats.update(np.array([number, number, number, 10.0 * number]).astype(np.uint16))
     return repeats.is_fault
 

@@ -38,14 +38,14 @@ class Rig(Protocol):
     clock: Clock
 
     def torque(self) -> list[bool]:
-        """Return, for each servo, True if its motor is driven."""
+        """Return a list that contains True for each servo whose motor is driven."""
 
     def close(self) -> None:
         """Close the backend."""
 
 
 class SimulatedRig:
-    """The simulated backend on a virtual clock."""
+    """The simulated backend, which uses a virtual clock."""
 
     def __init__(self, _: pytest.MonkeyPatch, **sections: Any) -> None:
         settings = Settings.model_validate({"material": {"law": "constant"}, **sections})

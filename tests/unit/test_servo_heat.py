@@ -113,7 +113,7 @@ HOLD = 600.0  # s
 
 
 def recorded(plant: ServoHeat) -> dict[str, Any]:
-    """Return the recorded values of a hold at 1 A."""
+    """Record a hold at 1 A and return its values."""
     t, shown = np.arange(0.0, HOLD, 0.5), []
     for _ in t:
         plant.step(1.0, 0.5)
@@ -141,7 +141,7 @@ def test_servo_constants_are_identified_from_a_hold(tmp_path, monkeypatch, capsy
     assert told == pytest.approx(t, rel=0.05)
     follow(law(state).array, 1.0, 0.5, 25.0)
     state.x[:3] = 25.0
-    # With the model's constants, the prediction is wrong.
+    # The model's own constants give a wrong prediction.
     assert abs(time_to_limit(state.array, 1.0, 60.0) / t - 1.0) > 0.2
 
 
@@ -153,7 +153,7 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
-    """Grip with servos that overheat quickly; frames have half the usual rate."""
+    """Grip with servos that overheat quickly, at half the usual frame rate."""
     sections |= {"simulation": {"servo_heat": FAST, "ambient": 35.0}, "tactile": {"rate": 50.0}}
     hand = SimulatedDaemon(sections)
     hand.grasp(force)
@@ -179,7 +179,7 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
         assert {level for level, _ in told} == {"warning"}
         eased = hand.state.goal.force
         assert eased < 22.0
-        hand.command("grasp", force=24.0)  # The force is requested again while the servos are hot.
+        hand.command("grasp", force=24.0)  # Request 24 N again with hot servos.
         hand.run(1.0)
         assert hand.state.goal.force == pytest.approx(eased)
 

@@ -1,4 +1,4 @@
-"""Compare instructions sent through packet handler and bus with direct access to the tables."""
+"""Compare instructions sent through packet handler and bus with direct access to servo tables."""
 
 import dynamixel_sdk as sdk
 import numpy as np
@@ -63,7 +63,7 @@ def test_any_instruction_equals_direct_access(steps, angles):
                 continue
             if kind == "write":
                 result, error = handler.writeTxRx(port, servo_id, address, len(what), list(what))
-                error &= 0x7F  # Bit 7 reports a hardware error, which limits may cause.
+                error &= 0x7F  # Ignore bit 7, which reports hardware errors.
                 assert (result, error) == (
                     sdk.COMM_SUCCESS,
                     servos[servo_id].write(address, what, t),

@@ -1,4 +1,4 @@
-"""Test that profiles are loaded, and that one report lists all errors of a profile."""
+"""Test that profiles are loaded, and that all errors of a profile are listed at once."""
 
 import json
 import tomllib

@@ -49,8 +49,8 @@ def test_the_grip_force_decreases_after_the_load_is_removed():
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(4.0)
         assert hand.mode == "holding"
-        # The load is removed while the fingers close. The estimator then attributes part of the
-        # change to a stiffer tip.
+        # The load ends while the fingers close, so the estimator attributes part of the change to a
+        # stiffer tip.
         assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.1)
 
 
@@ -130,7 +130,7 @@ def test_a_load_is_detected_only_beyond_joint_friction():
     watched.grip.begin_holding()
     assert watched.run(1.5, 500) == FORCE
     assert watched.grip.slip.load == 0.0
-    # The controller increases the detected load by the load that friction may hide.
+    # The controller adds the load that friction may hide to the detected load.
     for load in np.linspace(1.5, 6.0, 500):
         watched.run(load, 1)
     found = watched.run(6.0, 500)
@@ -163,7 +163,7 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     # The limit is the force including the error of the torque constant, plus friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
-    # Once the measured force has risen, the controller holds the force that the reflex has set.
+    # Once the measured force has increased, the controller keeps the force set by the reflex.
     watched.held.force = [FORCE + 10.0] * 2
     watched.run(2.0 * FRICTION, 1)
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
@@ -178,7 +178,7 @@ def test_a_sudden_twist_immediately_raises_the_grip():
 
 
 def test_a_constant_load_leaves_less_margin_for_a_sudden_one():
-    """If each tip carries 3 N, the reflex reacts to a sudden load that would be harmless alone."""
+    """If each tip already carries 3 N, a smaller sudden load triggers the reflex."""
     watched = at_rest()
     for load in np.linspace(0.0, 3.0, 500):
         watched.run(load, 1)
@@ -196,7 +196,7 @@ def test_shear_of_solid_tips_reveals_a_load(kind):
 
 
 def test_a_load_on_one_joint_alone_is_not_a_sudden_load():
-    """If only one joint appears loaded, its current is wrong or the joint has failed."""
+    """If only one joint appears loaded, its current is wrong or the joint is defective."""
     watched = at_rest()
     for torque in (0.3, -0.3, 0.3):
         watched.held.torque_residual = [0.0, torque]
@@ -233,7 +233,7 @@ def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
 
 
 def standing(load: float, asked: float = 4.0) -> GripUnderLoad:
-    """Return a grip under a load that has increased slowly while the joints did not move."""
+    """Return a grip after a slow increase of the load, during which the joints did not move."""
     watched = at_rest(asked)
     for part in np.linspace(0.0, load, 500):
         watched.run(part, 1, normal=asked)
@@ -248,7 +248,7 @@ def test_a_load_is_still_known_after_the_force_has_changed():
     watched.run(3.0 * FRICTION, 50, holding=False, normal=raised)
     watched.grip.begin_holding()
     assert watched.run(3.0 * FRICTION, 1000, normal=raised) > 1.5 * 4.4
-    # The load is removed during a change, and the force then returns to the commanded value.
+    # Remove the load during a force change; the force must then return to the commanded value.
     watched.grip.retarget(4.8)
     watched.run(0.0, 50, holding=False, normal=raised)
     watched.grip.begin_holding()

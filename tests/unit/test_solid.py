@@ -38,8 +38,8 @@ def test_partial_derivatives_belong_to_one_energy(tip):
     c, h = table(d, theta), 1e-6
     assert c.inside.all()
     if tip.face == "sticking":
-        # A shear force up the slope increases the force on the base. A larger tilt causes a larger
-        # increase.
+        # On a tilted face, the shear force increases the force on the base. A larger tilt causes a
+        # larger increase.
         held = c.force / (np.cos(theta) * c.energy_d) - 1.0
         assert held[2] == pytest.approx(0.0, abs=1e-12)
         assert (held[0] < 0.2).all()
@@ -125,8 +125,8 @@ def test_the_estimate_reaches_its_bound_for_any_shear(tip, counts):
                 assert [found.shear_x, found.shear_y] == pytest.approx(shear, rel=0.01, abs=0.1)
                 error = [found.d - d, found.tilt_x - tilt_x, found.tilt_y - tilt_y]
                 squares.append(error @ np.linalg.solve(found.covariance[:3, :3], error) / 3.0)
-    # With 96 frames of three values, the mean is 1 ± 0.08. The mean is larger for contacts in which
-    # some cells are under tension and measure nothing.
+    # With 96 frames of three values, the mean is 1 ± 0.08. The mean is larger if some cells are
+    # under tension and therefore measure nothing.
     assert 0.7 < np.mean(squares) < 1.4
 
 
@@ -283,7 +283,7 @@ def test_unsuitable_profiles_of_a_solid_tip_are_refused():
 
 
 def _odd_frames() -> dict[str, np.ndarray]:
-    """Return frames with strong signals that no contact of a solid tip causes."""
+    """Return frames with strong signals that a solid tip's contact cannot cause."""
     (pitch, _), shape = GRID.pitches, GRID.shape
     y, x = (np.indices(shape) - 0.5 * (np.array(shape)[:, None, None] - 1.0)) * pitch
     radius = np.hypot(x, y)

@@ -32,10 +32,10 @@ action = st.one_of(
 
 
 class Scene:
-    """Gateway, link and loop that act step by step.
+    """A gateway, a link and a loop, each of which acts step by step.
 
-    Each event increments a counter. The value of the counter when an ``arm`` was first sent
-    identifies the ``arm``.
+    Each event increments a counter. Each ``arm`` is identified by the value of the counter when the
+    ``arm`` was first sent.
     """
 
     def __init__(self, folder: str) -> None:
@@ -104,7 +104,7 @@ class Scene:
 
 @contextmanager
 def played() -> Iterator[Scene]:
-    """Yield a scene that replaces the socket of its gateway."""
+    """Yield a scene that replaces the gateway's socket."""
     with TemporaryDirectory() as folder:
         scene = Scene(folder)
         with (
@@ -158,7 +158,7 @@ def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
 
 
 def test_a_flood_does_not_count_as_old_forever():
-    """The limit on connections limits the backlog, even if the socket is never empty."""
+    """The maximum number of connections limits the backlog, even if the socket is never empty."""
     with (
         patch.object(bounds, "CLIENT_COUNT_MAX", 1),
         patch.object(bounds, "SOCKET_QUEUE_LENGTH", 20),

@@ -1,4 +1,4 @@
-"""Test the publisher on a real socket, with subscribers of all kinds."""
+"""Test the publisher with stuck, late and invalid subscribers on a real socket."""
 
 import json
 from collections.abc import Iterator

@@ -30,7 +30,7 @@ HARD = {
     "s-shaped": Material.from_points(Y, 1e5 * (Y + 0.12 * np.sin(6.0 * Y))),
     "root": Material.from_points(Y, 1e5 * Y**0.7),
 }
-# The compiler may fuse other multiplications and additions in a loop than in a function call.
+# In a loop, the compiler may fuse other multiplications and additions than in a function call.
 FUSED = 1e-12
 OUTPUTS = ("force", "energy", "force_d", "force_theta", "energy_d", "energy_theta")
 
@@ -150,7 +150,7 @@ def test_symmetry_sign_and_monotonicity(table, depth, share):
 @pytest.mark.parametrize("modulus", [1.0, 1e9])
 @pytest.mark.parametrize("radius", [1e-4, 1.0])
 def test_scaling_with_radius_and_modulus(table, radius, modulus):
-    """Test radii from 0.1 mm to 1 m, and moduli at zero strain from 1 Pa to 1 GPa."""
+    """Test radii from 0.1 mm to 1 m, and zero-strain moduli from 1 Pa to 1 GPa."""
     scale, share = radius / TIP.radius, Fraction(modulus) / TABLE_I.coefficients[0]
     other = Material(tuple(value * share for value in TABLE_I.coefficients))
     large = ContactTable.build(Fingertip(radius), other, 1e-9)
@@ -179,7 +179,7 @@ def test_lookups_outside_the_domain_cause_a_warning(table):
         table(d, theta)
     assert [each.filename for each in caught] == [__file__]
     assert table(d, theta, edge=True).inside.sum() == 3
-    table(d[:3], theta[:3])  # A warning would raise an error.
+    table(d[:3], theta[:3])  # This call must not warn.
     table(0.008, -float(TIP.theta_limit(0.008)) * (1.0 + 1e-15))
 
 
@@ -212,7 +212,7 @@ def test_values_outside_the_domain_are_clamped_and_flagged(table):
         for sign in (1, -1):
             c = table(0.008, sign * theta)
             assert not c.inside
-            # The test's limit and the lookup's limit may differ in rounding.
+            # The test and the lookup may round the limit differently.
             assert c.force == pytest.approx(edge.force, rel=FUSED)
             assert c.energy_theta == pytest.approx(sign * edge.energy_theta, rel=FUSED)
     for theta in (0.0, 0.1, -0.12):

@@ -1,4 +1,4 @@
-"""Test how commands switch torque while servos reply arbitrarily."""
+"""Test how commands and faults switch torque, also if servos ignore writes."""
 
 import math
 
@@ -40,7 +40,7 @@ def test_joints_are_held_at_their_positions_once_torque_is_on(make):
 
 
 def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
-    """Lose all writes; successful reads keep resetting the watchdogs of the servos."""
+    """Lose all writes; successful reads keep the servos' watchdogs from tripping."""
     daemon = make()
     events = heard(daemon)
     command(daemon, "arm")
@@ -133,7 +133,7 @@ def test_failed_arming_is_a_fault_with_torque_off(make):
 
 def test_a_stall_that_trips_the_servo_watchdog_is_a_fault(make):
     daemon = grasped(make(), 6.0)
-    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # The process was suspended here.
+    daemon.clock.sleep_until(daemon.clock.now() + 0.5)  # Simulate a suspended process.
     advance_to(daemon, "fault", 0.1)
     assert "watchdog" in daemon.loop.state.fault
     daemon.loop.advance(0.2)

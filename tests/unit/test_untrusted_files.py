@@ -26,7 +26,7 @@ from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
 
-ROOM = 200e6  # bytes by which the address space may grow
+ROOM = 200e6  # number of bytes by which the address space may grow
 
 
 @pytest.fixture(autouse=True)
@@ -209,7 +209,7 @@ def chunks_of_holes(path: Path) -> None:
 
 
 SMALL, LARGE = message(b"{}") * 100_000, bytes(70 << 20)
-# Functions that return the content after the header, or that write the whole file.
+# Functions that return the file's content after its header, or that write the whole file
 BOMBS: dict[str, Callable[[], bytes] | Callable[[Path], None]] = {
     "zstd": lambda: squeezed(LARGE),
     "zstd that claims little": lambda: squeezed(LARGE, 1000),

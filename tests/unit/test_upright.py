@@ -1,4 +1,4 @@
-"""Test that a grip turns an object upright without measuring the object's angle."""
+"""Test the control law that turns an object upright without measuring the object's angle."""
 
 import math
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_alon
 # half the distance of the pivots, finger length, finger offset and tip radius [m]
 LENGTHS = (0.05, 0.08, 0.0, 0.02)
 START = math.radians(5.0)
-DEPTH, FORCE = 0.0032, 10.0  # The paper's tip has this force at this depth.
+DEPTH, FORCE = 0.0032, 10.0  # the paper's tip at this indentation
 spring_of = upright_spring.py_func
 
 
@@ -30,7 +30,7 @@ def resting_ratio(spring: float) -> float:
 
 
 def at_rest(spring: float) -> SimulatedHand:
-    """Increase the force on a tilted object slowly to 10 N, with friction only at the tips."""
+    """Slowly increase the force on a tilted object to 10 N; friction acts only at the tips."""
     hand = make(
         PAPER, object_angle=START, joint_friction=0.0, table_friction=0.0, joint_damping=0.1
     )
@@ -95,8 +95,8 @@ def test_the_upright_law_does_not_use_the_angle(sense, angle_known, simulation):
 
 
 def test_solid_tips_bring_the_object_upright() -> None:
-    # The energy of bonded rubber has no local minimum. The control law therefore computes another
-    # stiffness from the contact table of these tips.
+    # The energy of bonded rubber has no local minimum. For bonded rubber, the control law therefore
+    # uses the stiffness from the contact table.
     sections = load(Path("solid")).model_dump(include={"tip", "material", "estimator", "safety"})
     simulation = {"object_angle": START}
     with SimulatedDaemon(
@@ -110,7 +110,8 @@ def test_solid_tips_bring_the_object_upright() -> None:
 
 
 def test_late_ticks_do_not_slow_the_dither() -> None:
-    # A dither with a quarter of the frequency would swing the object out of the grip.
+    # If late ticks slowed the dither to a quarter of its frequency, the object would leave the
+    # grip.
     with SimulatedDaemon(
         {"control": {"law": "upright"}, "simulation": {"object_angle": START}}
     ) as hand:

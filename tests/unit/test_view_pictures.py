@@ -151,7 +151,7 @@ def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
     centre = HAND.tips(Q)[finger]
     assert -outwards @ out == pytest.approx(math.cos(theta[finger]))
     assert (middle - centre) @ outwards == pytest.approx(-(0.02 - d[finger]))
-    # The drawn force starts at the point of the face above the pressure centroid on the base.
+    # The drawn force arrow starts on the face, directly above the pressure centroid on the base.
     along = (lines.base[1] - lines.base[0]) / 0.04
     assert -outwards @ along == pytest.approx(math.sin(theta[finger]))
     foot = (lines.push[0] - centre) @ along
@@ -184,7 +184,7 @@ def test_colours_are_steps_of_the_cube_root_of_energy() -> None:
         np.minimum(root, 1.0), abs=0.6 / (LEVELS - 1.0)
     )
     assert (np.abs(theta) <= TIP.theta_limit(d) + 1e-3).all()
-    assert (shown.levels == LEVELS).any()  # The picture also shows contacts that are impossible.
+    assert (shown.levels == LEVELS).any()  # Impossible contacts are drawn, too.
 
 
 # Settings of the hand

@@ -60,7 +60,7 @@ Make = Callable[..., Daemon]
 
 @pytest.fixture
 def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
-    """Return a function that creates an armed daemon in virtual time with the given wiring."""
+    """Return a function that creates an armed daemon with the given wiring, in virtual time."""
     with ExitStack() as stack:
 
         def make(wiring: str, **simulation: Any) -> Daemon:
@@ -82,7 +82,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
 
 def greatest_force(daemon: Daemon, seconds: float) -> float:
-    """Return the maximum true tip force during ``seconds`` or until a fault."""
+    """Run for ``seconds`` or until a fault; return the maximum true tip force."""
     greatest = 0.0
     for _ in range(round(seconds / 0.02)):
         daemon.loop.advance(0.02)
@@ -109,7 +109,7 @@ def test_swapped_servos_are_detected_during_the_approach(make, off, object_):
 
 @pytest.mark.parametrize(("follows", "swapped"), [(0, True), (1, False)])
 def test_the_tilt_shows_whose_motion_a_tip_follows_despite_a_light_contact(follows, swapped):
-    """Tilt the right tip as one joint rotates, and interrupt the tip's contact every 50 ms."""
+    """Tilt the right tip while one joint rotates, and interrupt the tip's contact every 50 ms."""
     watch, state = WiringWatch((0, 1)), State(mode=Mode.GRASPING)
     state.reading.valid = True
     state.contacts[0].invalid = state.contacts[1].invalid = Invalid.NONE
@@ -206,7 +206,7 @@ def test_fingers_that_stand_in_the_approach_are_reported(make):
     daemon = make("reversed")
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q[0] > -0.54:  # Wait until the joint reaches its stop.
+    while daemon.hand.q[0] > -0.54:  # Wait for the joint to reach its stop.
         daemon.loop.advance(0.02)
     daemon.loop.advance(1.0)
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]

@@ -1,1 +1,1 @@
-"""Minimal backends in a package of their own."""
+"""Provide minimal backends as a separate package."""

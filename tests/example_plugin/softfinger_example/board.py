@@ -46,7 +46,7 @@ class PulsingBoard:
         return self._frame
 
     def counters(self) -> dict[str, int]:
-        """Return the number of frames generated."""
+        """Return the number of frames generated so far."""
         return {"frames": 0 if self._frame is None else self._frame.seq}
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ from softfinger.daemon.types import Goal, Reading
 
 
 class FollowingServos:
-    """Servos without a bus or motors, which report the last goal as the measured angle."""
+    """Servos that have no bus or motors, and report the last goal as the measured angle."""
 
     def __init__(self, settings: Settings, clock: Clock) -> None:
         self._clock = clock
