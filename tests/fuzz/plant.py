@@ -12,7 +12,7 @@ from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
 
-LONGER = 10  # One in three hands uses a time step that is longer by this factor.
+LONGER = 10  # factor by which the time step of every third hand is longer
 EACH = 400  # number of commands per hand
 SHAPES = ("rectangle", "rectangle", "disc", "wedge", "none")
 # Columns of a command: joint, mode, torque on, goal, current, three load components, load set,

@@ -38,7 +38,7 @@ def softfinger(*words: object, **options: Any) -> subprocess.CompletedProcess[st
 
 def pip_installed(package: Path, folder: Path) -> Path:
     """Install one package of this repository with pip and return its location."""
-    shutil.copytree(package, folder / "source")  # Copy the folder; the build changes it.
+    shutil.copytree(package, folder / "source")  # The build changes the copied folder.
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet")
     words = ("install", *options, "--target", folder / "site", folder / "source")
     done = python("-m", "pip", *words)

@@ -68,7 +68,7 @@ def end(processes: set[int]) -> None:
             os.kill(process, signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             os.waitpid(process, 0)
-        end(below)  # This process has adopted the children of the killed process.
+        end(below)  # The children of the killed process are now children of this process.
 
 
 def _sweep(word: bytes) -> bool:

@@ -26,7 +26,7 @@ from tests.harness.daemon_process import SOFTFINGER, Running
 
 _BUSY = "DOCUMENTED_BUSY"  # environment variable that makes `softfinger` run as a separate process
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
-# Commands with one of these options exit on their own, so the tests run them.
+# With one of these options, a command exits on its own, so the tests run the command.
 _ENDS = {"--record", "--recompute"}
 _SHOWN = re.compile(r"# (?P<mode>\w+)(?: (?P<force>[\d.]+) N)?(?:.*?(?P<angle>-?[\d.]+)°)?")
 _CLIENT = """\

@@ -48,7 +48,7 @@ class Browser:
         self.process = subprocess.Popen(
             [path, *words, "about:blank"], start_new_session=True, **quiet
         )
-        told = folder / "DevToolsActivePort"  # The browser writes this file once it is listening.
+        told = folder / "DevToolsActivePort"  # The browser writes the file once its port is open.
         until(lambda: told.exists() and "/" in told.read_text())
         pages: list[dict[str, Any]] = []
 
@@ -57,7 +57,7 @@ class Browser:
                 pages[:] = [each for each in json.load(answer) if each["type"] == "page"]
             return bool(pages)
 
-        until(listed)  # The browser starts listening before it opens its first page.
+        until(listed)  # The browser opens its port before its first page.
         waits: Any = {"open_timeout": WAIT, "ping_interval": None}
         url = pages[0]["webSocketDebuggerUrl"]
         self._socket = connect(url, proxy=None, max_size=None, **waits).__enter__()

@@ -15,8 +15,8 @@ that are equal by symmetry become different. Integers are not changed, because e
 computes sin 0 and cos 0 exactly.
 
 The option does not affect operators (``+``, ``@``), array methods, intermediate results of kernels,
-modules imported within a function, or other processes. `tests.harness.arithmetic` covers the
-omitted cases with another BLAS and other machine code.
+modules imported within a function, or other processes. `tests.harness.arithmetic` uses another BLAS
+and other machine code, and thereby covers the computations that the option does not affect.
 """
 
 import importlib

@@ -58,7 +58,7 @@ def why_not_open(sensor: TactileSensor) -> str:
 
 
 class Rig:
-    """One backend, and the board, hand or recording that generates its frames."""
+    """A backend, together with the board, hand or recording that generates its frames."""
 
     def __init__(
         self, backend: str, folder: Path, fault: str = "", rows: int = ROWS, source: Any = None

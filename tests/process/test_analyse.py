@@ -21,7 +21,7 @@ TILT = 0.1
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    """Return counts for indentations of up to 5 mm at a tilt of 0.1 rad, without noise."""
+    """Return noise-free counts for indentations of up to 5 mm at a tilt of 0.1 rad."""
     grid = SensorGrid(rows=44, cols=44, pitch=PITCH)
     material = Material.table_i()
     frames = [grid.pressure(TIP, material, d, TILT, 0.0) for d in DEPTHS[1:]]

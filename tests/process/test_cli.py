@@ -90,7 +90,7 @@ def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
 )
 def test_a_signal_during_start_up_exits_without_a_traceback(profile, number):
     process = started("run", "--config", profile(""))
-    # The daemon prints this line after installing signal handlers and before compiling.
+    # The daemon prints the line after installing signal handlers and before compiling kernels.
     first = process.stderr.readline()
     process.send_signal(number)
     said = first + process.communicate(timeout=300)[1]
@@ -136,9 +136,9 @@ def stalled(daemon: Any, context: Any, *requests: dict[str, Any]) -> list[dict[s
     daemon.running.process.send_signal(signal.SIGSTOP)
     for request in requests:
         socket.send_multipart([b"", msgpack.packb(request)])
-    # This message exceeds the size limit, so the gateway itself refuses it.
+    # The gateway itself refuses any message above the size limit.
     socket.send_multipart([b"", b"x" * 5000])
-    assert socket.poll(60_000)  # The gateway has also read all earlier requests.
+    assert socket.poll(60_000)  # By then, the gateway has also read all earlier requests.
     assert msgpack.unpackb(socket.recv_multipart()[-1])["reason"] == "request"
     select.select([], [], [], 0.5)  # Stall for half a second.
     daemon.running.process.send_signal(signal.SIGCONT)

@@ -236,7 +236,7 @@ def test_a_cancelled_command_is_not_repeated(fake):
                 await arming
 
     fake.replies["arm"] = LATE
-    asyncio.run(cancelled())  # This call returns when the current attempt ends.
+    asyncio.run(cancelled())  # The call returns after the current attempt.
     count, published = len(fake.requests), fake.published
     until(lambda: fake.published > published + 50)  # Wait for half a second.
     assert len(fake.requests) == count
@@ -255,7 +255,7 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     for seq in (5, 10, 16, 30, 36):  # The publisher sends every fifth state.
         gaps.take({"seq": seq, "seq_step": 5})
     assert gaps.lost == 2
-    gaps.take({"seq": 5, "seq_step": 5})  # The daemon has restarted, and no message was lost.
+    gaps.take({"seq": 5, "seq_step": 5})  # The daemon restarted without losses.
     gaps.take({"seq": 10, "seq_step": 5})
     assert gaps.lost == 2
     for finger in ("left", "right"):  # Lost frames are counted per finger.
@@ -272,7 +272,7 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     assert again.lost == 2
     assert again.take({"seq": 7, "again": True})  # The repeated message fills a gap.
     assert again.lost == 1
-    assert again.take({"seq": 1, "again": False})  # This message comes from another daemon.
+    assert again.take({"seq": 1, "again": False})  # The message comes from another daemon.
     assert again.take({"seq": 5, "again": False})
     assert not again.take({"seq": 5, "again": True})
 
@@ -477,7 +477,7 @@ def in_a_thread(use: Callable[[], object]) -> BaseException | None:
 
 def test_a_second_thread_that_uses_the_stream_is_refused_at_once(fake, hand):
     states = hand.stream(60.0)
-    assert in_a_thread(hand.grasp) is None  # Commands use another socket than states.
+    assert in_a_thread(hand.grasp) is None  # Commands have their own socket.
     next(states)
     for use in (
         lambda: next(states),
@@ -538,7 +538,7 @@ def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     left, right = fake_daemon.finger(0.0, 0), fake_daemon.finger(0.0, 1)
     fake.changes = {"left": left, "right": right}
     before = fake.published
-    until(lambda: fake.published > before + 1)  # All later states include the changes.
+    until(lambda: fake.published > before + 1)  # From now on, all states include the changes.
     told = inline("status", "--address", fake.state_address)
     assert told.returncode == 0
     line = re.fullmatch(r"(\w+) (\S+) N \(\S+ ± \S+, \S+ ± \S+\), (\S+)°, (\S+) mm\n", told.stdout)

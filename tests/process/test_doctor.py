@@ -37,7 +37,7 @@ from tests.harness.gateway import Served
 
 
 class Hand:
-    """Emulated hand that runs in a thread and that the doctor examines."""
+    """Emulated hand for the doctor to examine, which runs in a thread."""
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.folder = folder
@@ -266,14 +266,14 @@ def test_unusable_ports_fail(tmp_path, terminal, monkeypatch):
 @pytest.mark.parametrize("locked", [True, False])
 def test_the_process_using_a_port_is_named(terminal, locked):
     path = terminal
-    # This process owns the pty's master, so it does not count as a user of the port.
+    # The test process owns the pty's master, so it does not count as a user of the port.
     script = (
         "import fcntl, os, sys; d = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)\n"
         f"if {locked}: fcntl.flock(d, fcntl.LOCK_EX)\n"
         "print('open', flush=True); sys.stdin.read()"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    # The command line of this process looks like the daemon's command line.
+    # Start a process whose command line resembles the daemon's command line.
     words = [sys.executable, "-c", script, path, "softfinger", "run"]
     with ending(subprocess.Popen(words, **pipes)) as other:
         assert other.stdout.readline() == "open\n"

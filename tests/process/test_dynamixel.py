@@ -83,7 +83,7 @@ def test_torque_on_starts_at_the_current_position(bus, connect):
     assert read(backend).q == pytest.approx([0.4, -0.3], abs=RADIAN)
     assert backend.torque_off(Reading())
     assert all(bus.memory(i)[reg.TORQUE_ENABLE] == 0 for i in (0, 1))
-    # The servos do not reply to this write, so wait for its effect.
+    # The servos do not acknowledge the write, so wait until the register changes.
     until(lambda: all(bus.memory(i)[reg.BUS_WATCHDOG] == 0 for i in (0, 1)))
 
 
@@ -192,7 +192,7 @@ def test_corrupted_replies_never_give_wrong_readings(running, kind, firmware, co
 @FIRMWARES
 def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connect):
     bus = running(placed(firmware, 0, 0))
-    backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # A late reply arrives after 0.01 s.
+    backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # Late replies take 0.01 s.
     reading = Reading()
 
     def at_another_place(count: int) -> None:

@@ -17,8 +17,7 @@ from tests.soak.rig import Rig
 
 pytestmark = pytest.mark.extended
 FORCE = 6.0  # N
-# Durations of a test, and of the final interval over which means are taken, on the hand's clock
-# [s].
+# Duration of a test, and of the averaging interval at its end, measured on the hand's clock [s].
 LOOK, SETTLED = 3.5, 0.5
 
 GAIN = "left:gain=0.6@0..2"
@@ -56,7 +55,7 @@ def reaches(rig: Rig, wanted: str) -> None:
 
 
 def gripped(rig: Rig) -> None:
-    """End all sensor faults, and let the hand hold the object at its initial position."""
+    """End all sensor faults, and let the hand hold the object at the object's initial position."""
 
     def done(command: str, **numbers: float) -> None:
         reply: dict[str, Any] = rig.ask({"command": command, **numbers}, 60.0)

@@ -1,4 +1,4 @@
-"""Test how `doctor` times the bus exchange, and checks when connecting and while disarmed."""
+"""Test the doctor's bus timing, and the servo checks during connection and while disarmed."""
 
 import contextlib
 import grp
@@ -140,7 +140,7 @@ def test_slow_replies_are_reported_at_start_up(bus):
 
 
 def test_the_port_stays_open_while_a_board_boots(running, monkeypatch):
-    """Opening the port may restart the board, so the backend must not open the port again."""
+    """Opening the port may restart the board, so the backend must open the port only once."""
     bus, opened = running(), []
     for i in (0, 1):
         bus.servo(i).silent = True

@@ -100,7 +100,7 @@ def test_nan_values_are_empty_cells(tmp_path):
     writer = RecordingWriter(tmp_path / "a.mcap")
     message = sample(schema.STATE)
     message["left"]["force"] = math.nan
-    message["news"] = 3.5  # Only newer daemons send this field.
+    message["news"] = 3.5  # Only newer daemons send the field.
     writer.add(schema.STATE, message)
     writer.close()
     export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [schema.STATE])

@@ -237,7 +237,7 @@ def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
                 client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
         until(lambda: connections(address) < CLIENT_COUNT_MAX)
         with connected(address) as line:
-            Client(line)  # The server accepts this client.
+            Client(line)  # The server must accept a new client.
 
 
 def test_incomplete_and_invalid_requests_are_closed(stranger):

@@ -231,7 +231,7 @@ def test_a_local_stop_works_when_all_client_slots_are_used(ticking, addresses, i
             os.kill(ticking.gateway.process.pid, signal.SIGCONT)
         assert hand.wait_for(lambda state: not state.torque, 60.0).mode == "disarmed"
         hand.stop()
-        hand.arm()  # The gateway receives all commands that are sent after this reply.
+        hand.arm()  # From now on, all commands reach the gateway.
         hand.stop()
 
 

@@ -26,8 +26,7 @@ REAL = [
     *("--set", f"servos.watchdog={WATCHDOG}", "--set", f"servos.fault_after={WATCHDOG}"),
     *("--set", "servos.reply_timeout=0.1", "--set", "servos.open_timeout=60"),
 ]
-# These timeouts are measured on the hand's clock, which hardly advances while the emulator gets no
-# processor time.
+# timeouts on the hand's clock, which hardly advances while the emulator gets no processor time
 WAITING = [
     *("--set", "servos.fault_after=1.0", "--set", "safety.frame_age_fault=100"),
     *("--set", "servos.open_timeout=60"),
@@ -69,7 +68,7 @@ class Rig:
         assert reply["ok"], reply
 
     def at_work(self) -> list[dict[str, Any]]:
-        """Arm a disarmed hand and start moving; return the report on its servos."""
+        """Arm a disarmed hand and start moving; return the servo report."""
         self.does("arm")
         self.does("move", left=0.3, right=0.3)
         servos: list[dict[str, Any]] = []
@@ -231,7 +230,7 @@ def test_servos_stop_by_themselves_and_the_hand_works_again(rig):
     send_words(rig.folder, "forget")
     rig.works()
 
-    # Remove the other end of the line permanently.
+    # Close the emulator's end of the line permanently.
     rig.at_work()
     rig.hand.popen.kill()
     until(lambda: rig.status()["mode"] == "fault")
@@ -268,7 +267,7 @@ def test_lost_packets_do_not_keep_torque_on(rig):
     send_words(rig.folder, "lose-writes=0")
     rig.clears()
 
-    # Lose nine of ten packets in both directions.
+    # Lose nine out of ten packets in each direction.
     rig.at_work()
     send_words(rig.folder, "lose=0.9 drop=0.9")
     rig.send("stop")

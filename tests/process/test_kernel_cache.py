@@ -1,4 +1,4 @@
-"""Test that kernels compiled by other users or from other sources are never run.
+"""Test that kernels compiled by other users or from different source code are never run.
 
 The tests use a small package with the structure and the real decorators of softfinger. The tests
 modify the package's files and run the kernels in separate processes.
@@ -83,7 +83,7 @@ class Package:
         file.write_text(text, encoding="utf-8")
 
     def run(self, script: str = RUN) -> tuple[list[str], str]:
-        """Run a script; return the words that the script prints, and its warnings."""
+        """Run a script; return the words and the warnings that the script prints."""
         environment = os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": ""}
         environment.pop("NUMBA_CACHE_DIR", None)
         # Python would load stale bytecode for a file that is rewritten within a second.

@@ -111,7 +111,7 @@ def test_a_daemon_with_keys_records_itself(guarded):
         return next((message for _, message in inputs), None)
 
     until(lambda: guarded.recording.stat().st_size > 3000)
-    until(first_input)  # The file may contain other topics first.
+    until(first_input)  # The file may start with messages of other topics.
     assert first_input()["seq"] == 1
 
 

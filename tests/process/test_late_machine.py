@@ -44,7 +44,7 @@ def test_a_simulated_hand_survives_a_suspended_machine(start, profile, hand):
         for mode in ("rotating", "holding", "releasing", "grasping"):
             state = after(states, mode)
             assert state.fault == ""
-        # The hand's clock advances only while its process runs.
+        # The hand's clock advances only while the hand's process runs.
         assert state.behind_s >= before.behind_s + 0.9 * STILL
         passed = 1e-9 * (state.mono_ns - before.mono_ns)
         assert passed == pytest.approx((state.seq - before.seq) / 100.0)

@@ -166,7 +166,7 @@ def record(kind, robot, first, action, moved, root):
     """Write two observations with LeRobot's own recorder and read them back."""
     try:
         from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
-    except ImportError:  # LeRobot 0.4 defines the functions in this module.
+    except ImportError:  # LeRobot 0.4 has another module name.
         from lerobot.datasets.utils import build_dataset_frame, hw_to_dataset_features
     features = hw_to_dataset_features(robot.action_features, "action", False)
     features |= hw_to_dataset_features(robot.observation_features, "observation", False)
@@ -187,7 +187,7 @@ def record(kind, robot, first, action, moved, root):
     np.testing.assert_allclose(picture, moved["left_touch"][:, :, 0], atol=1e-3)
 
 
-# Run only this module, because the package imports LeRobot.
+# Run the module by its path, because importing the package would import LeRobot.
 features = runpy.run_path(str(PACKAGE / "lerobot_robot_softfinger" / "features.py"))
 STATE, image, observation = (features[name] for name in ("STATE", "image", "observation"))
 

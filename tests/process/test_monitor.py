@@ -18,7 +18,7 @@ from tests.harness.descendants import ending
 from tests.harness.fake_daemon import FakeDaemon, finger
 from tests.harness.terminal_process import TerminalProcess
 
-NOBODY = "tcp://127.0.0.1:1"  # Nothing listens at this address.
+NOBODY = "tcp://127.0.0.1:1"  # address without a daemon
 
 
 def command(fake: FakeDaemon, *more: str) -> list[str]:
@@ -39,7 +39,7 @@ def test_page_shows_the_hand_and_the_state_of_its_stream(fake):
         fake.changes = {"mode": "fault", "fault": "left: no frame for 0.1 s"}
         page.shows("FAULT left: no frame for 0.1 s", "c clears it")
         fake.silent.set()
-        # For up to 1.5 s, the page shows the stream as stale; it then shows the stream as lost.
+        # The page shows the stream as stale for up to 1.5 s, and then as lost.
         page.shows("○ lost", "the stream has stopped")
         fake.changes = {}
         fake.silent.clear()
@@ -140,7 +140,7 @@ def test_keys_command_the_hand(fake):
             page.shows("✗ rotate: angle: too much")
         assert fake.requests[-1]["angle"] == pytest.approx(-0.00035, abs=1e-4)
         count = len(fake.requests)
-        # The page ignores a paste and unused keys.
+        # The page ignores pasted text and unused keys.
         page.type(b"\x1b[200~gado \x1b[201~zZ\x1b[A\x1b[15~")
         page.type(b" ")
         page.shows("✓ stop: ok")

@@ -124,7 +124,7 @@ def test_a_client_may_reconnect_and_leave_the_terminal_in_cooked_mode(wires):
 def test_a_client_that_never_reads_does_not_block_the_bus(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
     request = frame(1, framing.READ, b"\x00\x00\x93\x00")
-    for _ in range(400):  # A terminal can buffer only a fraction of these bytes.
+    for _ in range(400):  # far more bytes than a terminal can buffer
         wire.send(request)
     assert wire.port.bus.packets == 400
 

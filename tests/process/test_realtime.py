@@ -1,4 +1,4 @@
-"""Test that real-time measures are applied and reverted, and that refusals are reported."""
+"""Test that real-time measures are applied and reverted, and that denials are reported."""
 
 import ctypes
 import json
@@ -18,8 +18,8 @@ from softfinger.tools.benchmarks.measuring import Report, attempt
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENCE, python
 
-# This script applies all real-time measures. Before, during and after their use, the script prints
-# the properties of its process.
+# Script that applies and reverts all real-time measures. The script prints the properties of its
+# process before, during and after the use of the measures.
 HELD = """
 import json, os, sys, threading
 from pathlib import Path
@@ -60,7 +60,7 @@ finally:
     over.set()
 """
 
-# This script applies real-time measures without the necessary permissions.
+# Script that applies real-time measures without the necessary permissions.
 REFUSED = """
 import json, os, resource
 from softfinger.daemon.loop.realtime import RealTime

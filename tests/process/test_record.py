@@ -151,7 +151,7 @@ def test_non_finite_numbers_are_read_as_nan(tmp_path):
     assert writer.messages == 1
     [(_, read)] = Recording(tmp_path / "a.mcap").messages()
     assert math.isnan(read["left"]["force"])
-    assert math.isnan(read["tick_s"])  # JSON cannot represent infinity either.
+    assert math.isnan(read["tick_s"])  # JSON cannot represent infinity.
 
 
 @pytest.mark.extended
@@ -287,7 +287,7 @@ def test_messages_sent_before_the_end_are_written(addresses, tmp_path):
     for k in range(4000):
         publisher.send(schema.STATE, zmq.SNDMORE)
         publisher.send(pack({**message, "seq": k}))
-    context.destroy(linger=-1)  # This call returns after all messages are sent.
+    context.destroy(linger=-1)  # The call returns after all messages are sent.
     process.send_signal(signal.SIGTERM)
     status, out, _ = ended(process)
     assert status == 0

@@ -88,7 +88,7 @@ def held(bus: RunningBus, address: int, servo: int = 0) -> int:
 
 
 def told(bus: RunningBus, **servos: Any) -> list[Finding]:
-    """Return the doctor's findings on the left servo."""
+    """Return the doctor's findings about the left servo."""
     settings = backend_settings(bus.port, **servos)
     return [each for each in devices.check_servos(settings) if each.subject == LEFT]
 

@@ -1,4 +1,4 @@
-"""Test the checks when connecting, their suggested fixes, and readings of the servos' health."""
+"""Test the servo checks on connection, the suggested fixes, and the servo health readings."""
 
 import math
 import os
@@ -183,7 +183,7 @@ def test_forces_and_friction_that_overtax_a_model_are_notices(running):
     gears = "gear friction consumes 25% of the transmitted torque, so a grip may never settle"
     assert [each.text for each in lasting_notices(backend)] == 2 * [constant, gears]
     backend.close()
-    for name in ("hil", "small"):  # The servos in these profiles are strong enough.
+    for name in ("hil", "small"):  # profiles with sufficiently strong servos
         settings = load(find(Path(name)), Path("/tmp"))
         assert checks.notice_strength("", by_name(settings.servos.model), settings) == []
 

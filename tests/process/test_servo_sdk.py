@@ -1,4 +1,4 @@
-"""Test the SDK on emulated servos, with the SDK's packet handler and with softfinger's."""
+"""Test the SDK on emulated servos, with the packet handlers of the SDK and of softfinger."""
 
 from collections.abc import Iterator
 
@@ -47,7 +47,7 @@ def test_other_sdk_calls_work_with_our_handler(line):
     assert handler.write4ByteTxRx(port, 1, reg.PROFILE_VELOCITY, 77) == (OK, 0)
     assert handler.read4ByteTxRx(port, 1, reg.PROFILE_VELOCITY) == (77, OK, 0)
     assert handler.write1ByteTxOnly(port, 2, reg.LED, 1) == OK
-    # This write causes a reply, which must not count as the reply to the next request.
+    # The servo replies to the write; this reply must not count as the reply to the next request.
     assert handler.read1ByteTxRx(port, 2, reg.LED) == (1, OK, 0)
     bulk = sdk.GroupBulkRead(port, handler)
     bulk.addParam(1, reg.PRESENT_POSITION, 4)
@@ -63,7 +63,7 @@ def test_the_unmodified_sdk_works(bus):
     port = sdk.PortHandler(bus.port)
     handler = sdk.PacketHandler(2.0)
     assert port.openPort()
-    assert port.setBaudRate(1_000_000)  # This call closes and reopens the pty.
+    assert port.setBaudRate(1_000_000)  # The call closes and reopens the pty.
     # A busy machine may exceed the SDK's timeout of 35 ms.
     port.setPacketTimeout = lambda _: port.setPacketTimeoutMillis(60_000)
     assert handler.ping(port, 2) == (1020, OK, 0)
@@ -94,7 +94,7 @@ def test_error_bytes_of_a_group_read_are_kept(bus, line):
         group = kind(*line, reg.PRESENT_POSITION, 4, [1, 2])
         assert group.exchange() == OK
         assert group.errors == {1: 0x80, 2: 0}
-        # These addresses are beyond the end of the control table.
+        # The addresses are beyond the end of the control table.
         assert kind(*line, 660, 4, [1, 2]).exchange() != OK
 
 

@@ -1,4 +1,4 @@
-"""Test subcommands if packages are missing or Ctrl-C arrives in an import; test completion."""
+"""Test subcommands with missing packages, Ctrl-C during imports, and shell completion."""
 
 import signal
 import subprocess
@@ -44,7 +44,7 @@ def test_a_required_package_that_is_missing_is_named(tmp_path, missing, words, t
     assert not (tmp_path / "new.mcap").exists()
 
 
-# This program sends itself Ctrl-C during the import of a module.
+# Program that sends itself Ctrl-C during the import of a module.
 _AT = """
 import builtins, os, signal, sys
 from softfinger.tools import cli

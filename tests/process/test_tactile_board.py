@@ -85,8 +85,8 @@ def test_the_next_event_is_the_next_frame_delivery():
     source = Source()
     made = board(source, rate=100.0, delay=0.004)
     assert made.next_event() == -np.inf
-    # Due to rounding, an event may occur just before its frame is due. The board must not repeat
-    # such an event immediately.
+    # Due to rounding, an event may occur just before its frame is due. The board must not repeat an
+    # early event immediately.
     times = (0.0, 0.004, np.nextafter(0.014, 0.0), 0.0561)
     for seq, (t, due) in enumerate(zip(times, (0.004, 0.014, 0.024, 0.064), strict=True)):
         source.make(seq)
@@ -116,7 +116,7 @@ def test_without_a_reader_only_whole_frames_are_dropped(cells):
         got += client.expect(1) + client.read()
     assert got == frame * sent.count(True)
     assert client.read() == b""
-    assert writer.send(frame)  # The board continues once its output is read.
+    assert writer.send(frame)  # The board sends again once its output is read.
     os.close(client.fd)
     writer.close()
 

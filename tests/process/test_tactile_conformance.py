@@ -49,7 +49,7 @@ def test_numbers_and_times_only_increase(rig):
         seen.append(rig.wait(lambda frame: frame is not seen[-1]))
     assert (np.diff([frame.seq for frame in seen]) > 0).all()
     assert (np.diff([frame.t_sample for frame in seen]) >= 0).all()
-    # Frames that are read in one call have the same arrival time.
+    # If one read returns several frames, the frames have equal arrival times.
     assert (np.diff([frame.t_arrival for frame in seen]) >= 0).all()
 
 

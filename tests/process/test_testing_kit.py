@@ -240,7 +240,7 @@ def test_user_tests_pass(tmp_path, text, count):
     folder = tmp_path / "theirs"
     folder.mkdir()
     (folder / "test_it.py").write_text(text, encoding="utf-8")
-    # Other plugins in this environment import NumPy.
+    # Other installed plugins import NumPy.
     options = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest", "--strict-markers", "-q")
     environment = os.environ | {"PYTHONPATH": plugin_path(tmp_path / "site")}
     done = python("-m", "pytest", *options, folder, cwd=folder, env=environment)

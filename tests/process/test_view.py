@@ -148,7 +148,7 @@ def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
             # The viewer waits.
             assert any("no reply to arm" in line for line in viewed.process.stderr)
             viewed.process.send_signal(signal.SIGINT)
-            assert viewed.process.wait(WAIT) == 1  # No picture was displayed.
+            assert viewed.process.wait(WAIT) == 1  # exit status without any picture
 
 
 def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
@@ -166,7 +166,7 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # 5 s of pictures fill the page's queue.
+                return fake.published > begun + 500  # The queue of a page holds 5 s of pictures.
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
@@ -230,11 +230,11 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        # There are 31 levels for 50 kPa, and the peak is 45 kPa.
+        # The 31 levels represent up to 50 kPa, and the peak is 45 kPa.
         assert levels.max() > 20
         assert levels[20:24, 20:24].min() > 10
-        assert levels[:8].max() < 6  # These cells measure only noise.
-        # These lines show the rim and the footprint.
+        assert levels[:8].max() < 6  # cells outside the footprint
+        # One line is the rim, and the other line is the footprint.
         assert len(picture["panels"][name]["lines"]) == 2
         assert picture["panels"][name]["scale"] == ["≤ 3", "50 kPa"]
     assert len(picture["panels"]["landscape"]["dots"]) == 2
@@ -408,8 +408,8 @@ def test_other_machines_need_a_one_time_code() -> None:
         assert ask(viewed.host, query, {"command": "stop"}) == "✓ stop: ok"
         with pytest.raises(InvalidStatus, match="403"):
             ask(viewed.host, query, {"command": "stop"}, origin="http://evil.example")
-        assert got(viewed.host, code)[0] == 403  # Another browser has already used this code.
-        line = viewed.process.stdout.readline()  # The next browser may use this code.
+        assert got(viewed.host, code)[0] == 403  # A code is valid for only one browser.
+        line = viewed.process.stdout.readline()  # The server prints a new code.
         assert location(viewed.host, line.split()[1].removeprefix(f"http://{viewed.host}")) == place
         listening = psutil.Process(viewed.process.pid).net_connections()
         assert [each.laddr.ip for each in listening if each.status == "LISTEN"] == ["127.0.0.2"]
@@ -545,7 +545,7 @@ def test_invalid_messages_are_tolerated() -> None:
 
 def test_states_are_queued_while_a_picture_is_drawn(context, addresses):
     publisher = context.socket(zmq.XPUB)
-    publisher.setsockopt(zmq.SNDHWM, 2000)  # This is the daemon's value.
+    publisher.setsockopt(zmq.SNDHWM, 2000)  # same limit as in the daemon
     publisher.bind(addresses[0])
     kept, drawn = Kept(live=True), threading.Event()
     kept.pictures.draw, draw = drawn.wait, kept.pictures.draw
@@ -610,11 +610,11 @@ def test_invalid_input_is_reported_in_one_line(tmp_path, inline, monkeypatch, wo
 
 
 def test_pages_without_a_chosen_port_get_different_ports() -> None:
-    with ExitStack() as stack:  # Each page keeps its port.
+    with ExitStack() as stack:  # All ports stay open until the end.
         here = "127.0.0.1"
         ports = [stack.enter_context(listen(here, None)).getsockname()[1] for _ in range(3)]
         assert len(set(ports)) == 3
         with pytest.raises(ViewError, match=f"port {ports[0]}"):
             listen(here, ports[0])
         with pytest.raises(ViewError, match=r"--host 192\.0\.2\.1 can't be used"):
-            listen("192.0.2.1", None)  # This address is reserved for documentation.
+            listen("192.0.2.1", None)  # address reserved for documentation

@@ -128,7 +128,7 @@ class Page:
         self.browser.ask("Input.dispatchMouseEvent", type=kind, x=at[0], y=at[1], **named)
 
     def place(self, selector: str, across: float) -> tuple[float, float]:
-        """Return the point of an element at mid-height and at the fraction ``across`` of the width."""
+        """Return an element's point at mid-height and at the fraction ``across`` of the width."""
         left, width, top, height = self(
             "(({left, width, top, height}) => [left, width, top, height])"
             f"(document.querySelector('{selector}').getBoundingClientRect())"
@@ -245,7 +245,7 @@ def test_stale_data_are_marked(page, fake):
             return set(" ".join(page(names)).split()) - {"old", "card"}
 
         assert page.text(".mode") == "holding"
-        # A state counts as stale after this time.
+        # A state becomes stale after at most 0.5 s.
         assert page("picture.patience.state + scene.period") <= 0.5
         fake.dead.add("left")
         until(lambda: old() == {"left"})
@@ -397,7 +397,7 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
 def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page, fake):
     fake.changes = {"mode": "fault", "fault": "<b>tip.force</b>: 31 N"}
     with viewing(fake) as viewed:
-        page.open(viewed.address)  # The browser caches this page.
+        page.open(viewed.address)  # The browser caches the page.
         assert "Watching" in page.text("aside")
         page.click("#help")
         explained = page("document.querySelector('#explained').innerText")
@@ -438,7 +438,7 @@ def test_the_page_keeps_up_survives_sleep_and_reload_and_is_self_contained(page,
         ]
         assert not foreign
 
-        page.browser.open("data:text/html,another page")  # This page has a different origin.
+        page.browser.open("data:text/html,another page")  # a page with another origin
         until(lambda: page("location.protocol") == "data:")
         socket = f"new WebSocket('ws://{viewed.host}/pictures')"
         page(f"({socket}).onopen = event => window.came = event.type")
@@ -583,7 +583,7 @@ def test_a_saved_recording_is_played_from_its_file(page, tmp_path):
     page.focus("#place")
     page.key("Home", "Home", windowsVirtualKeyCode=36)
     until(lambda: page.text(".mode") == "disarmed")
-    # This value appears even while the playback is paused.
+    # The value appears even during a pause.
     until(lambda: page.text(".headline p span") == "0.0")
     assert page("past.rows.every(row => row[1] - view.start < 0.5)")
     page("document.activeElement.blur()")

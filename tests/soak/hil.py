@@ -47,7 +47,7 @@ _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # time between setpoints [s]
 _STREAM = 3.0  # duration of a setpoint stream [s]
 _SPLIT = 300  # duration of a recording file [s]; an open file's index uses memory
-# These faults leave the object tilted. The soak then puts the object upright.
+# Faults that leave the object tilted. After one of these faults, the soak puts the object upright.
 _ASKEW = ("hand.angle", "tip.tilt")
 _DROPPED = 20.0  # time without a grip after which the soak puts the object back [s]
 _HELD = 0.3  # minimum fraction of grasps that settle

@@ -49,7 +49,7 @@ _GRIPPING = ("grasping", "holding", "rotating")
 _COMMAND_EVERY = 150  # average number of ticks between commands
 _DISTURBED_EVERY = 800  # average number of ticks between loads or faults
 _DISTURBED_FOR = 500
-_WILD = 0.1  # fraction of commands that are drawn from all commands in any mode
+_WILD = 0.1  # fraction of commands that are drawn regardless of the mode
 _LOOKS = 96  # number of memory checks in a long sequence
 _WARM = 2  # number of memory checks in the warm-up, which takes ten minutes of eight hours
 _FLAT = 2.0  # maximum memory growth after the warm-up [MB]
@@ -81,11 +81,11 @@ LIES = {
 }
 LOADS = ("push", "twist")
 _TOO_LONG = 0.05  # maximum time above a bound on the tip force [s]
-_TOO_MUCH = 1.3  # maximum ratio of a tip force to the requested force without a load
-_UNSURE = 1.2  # maximum ratio of a tip force to the raised grip force under a load
+_TOO_MUCH = 1.3  # without a load: maximum ratio of a tip force to the requested force
+_UNSURE = 1.2  # under a load: maximum ratio of a tip force to the raised grip force
 _REMEMBERED = 5.0  # maximum time for which the grip force stays raised after a load or fault [s]
 _RETARGETED = 0.5  # maximum time until a newly requested force applies [s]
-_UNCOVERED = 1.0  # time for which a footprint outside the object excuses false reports [s]
+_UNCOVERED = 1.0  # time after a footprint left the object in which false reports are allowed [s]
 
 # Requirements. The soak counts how often each requirement is checked.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
@@ -128,7 +128,7 @@ class Judge:
 
 
 class Listener(Link):
-    """Receive and record all published messages, in place of the gateway."""
+    """Replacement for the gateway, which receives and records all published messages."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()

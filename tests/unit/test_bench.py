@@ -57,7 +57,7 @@ def test_interleaved_timing(monkeypatch):
 
 @pytest.fixture
 def canned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Return a tick measurement that takes no time."""
+    """Replace the tick measurement with a stored result."""
     table = Report("tick", [figure("pipeline alone, nobody subscribed", "µs", [20.0] * 5)])
     monkeypatch.setattr(tick, "measure", lambda brief: [table])
     monkeypatch.setattr(bench, "PAGE", ("tick",))

@@ -70,7 +70,7 @@ def test_cells_beyond_the_reach_of_the_tip_are_unused_for_any_blur(reading):
     frame = grid.pressure(TIP, LINEAR, 0.012, 0.25, 0.25)
     estimator = ContactEstimator(TIP, LINEAR, grid, noise)
     usual = estimator(frame)
-    # This cell is in the bounding box of the footprint. Its distance to the rim exceeds three
+    # The cell is in the bounding box of the footprint. The cell's distance to the rim exceeds three
     # standard deviations of the blur.
     frame[39, 39] = reading
     found = estimator(frame)

@@ -1,4 +1,4 @@
-"""Test each step of `softfinger calibrate` on a simulated sensor, and the file in the daemon."""
+"""Test `softfinger calibrate` on a simulated sensor, and the daemon's use of the file."""
 
 import json
 import math

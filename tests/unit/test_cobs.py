@@ -126,8 +126,8 @@ def test_the_sensor_clock_uses_the_minimum_delay_and_follows_drift_and_restarts(
 
 def test_the_longest_frame_consists_of_zeros():
     rng = np.random.default_rng(3)
-    # Half of the cells are zero, as in a frame without contact. A frame of zero bytes is the
-    # longest.
+    # Half of the cells are zero, as in a frame without contact. The encoded frame is longest if all
+    # its bytes are zero.
     frames = [
         encode(np.maximum(rng.normal(0, 380, (44, 44)), 0).astype(np.uint16), k, 0.01 * k)
         for k in range(30)

@@ -1,4 +1,4 @@
-"""Test the command server and client with requests of any order and form on real sockets."""
+"""Test the command server and client on real sockets, with requests in any order and form."""
 
 import os
 import select
@@ -100,14 +100,14 @@ def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
 ):
     socket = context.socket(zmq.DEALER)
     socket.connect(addresses[1])
-    socket.send_multipart([b"", b"a", b"b", b"c"])  # No client sends such a message.
+    socket.send_multipart([b"", b"a", b"b", b"c"])  # Real clients never send such a message.
     socket.send(msgpack.packb({"command": "arm"}))
     socket.close(linger=1000)
     assert send(addresses[1], {"command": "arm"}, 60.0)["ok"] is True
 
 
-# With a limit of 1, the second request waits in the queue. With a limit of 16, the second request
-# waits on the link.
+# If only 1 request may be unanswered, the second request waits in the queue. If 16 requests may be
+# unanswered, the second request waits on the link.
 @pytest.mark.parametrize("under_way", [1, 16])
 def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
     context, addresses, monkeypatch, under_way
@@ -475,7 +475,7 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
             return {}
 
         until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
-        served.serve(note)  # Let the gateway process part of the flood.
+        served.serve(note)  # Let the gateway process only part of the requests.
         carried_out = len(order)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)

@@ -74,8 +74,8 @@ def test_grasps_and_turns_also_with_mass_and_modulus_off_by_30_percent(
     "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
 )
 def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip_force(sections):
-    # Successive pushes of 1 N differ by up to 2 N. A sudden change of 2 N raises the grip force. A
-    # sideways push resembles a twist.
+    # Successive pushes of 1 N differ by up to 2 N. A sudden change of 2 N raises the grip force. To
+    # the estimator, a sideways push resembles a twist.
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
@@ -192,8 +192,7 @@ def test_a_known_load_raises_the_grip_within_its_bound():
         control = {"object_load": 12.0, "grip_raise_max": raised}
         with watched({"control": control}) as hand:
             seen = grasped(hand, force=8.0)
-            # With μ = 0.6, the load of 12 N is 80 % of the load that friction at both tips can
-            # carry.
+            # With μ = 0.6, the load of 12 N is 80 % of the tips' friction limit.
             assert hand.mode == "holding"
             assert seen.force[-200:].mean() == pytest.approx(expected, rel=KNOWN)
             assert any(

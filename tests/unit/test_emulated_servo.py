@@ -29,7 +29,7 @@ def client(**options: Any) -> BusClient:
         (reg.MODEL_NUMBER, 1, 2, framing.ACCESS),
         (reg.PRESENT_POSITION, 1, 4, framing.ACCESS),
         (14, 1, 1, framing.ACCESS),  # The register does not exist.
-        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # This address is inside a register.
+        (reg.GOAL_POSITION + 1, 1, 1, framing.ACCESS),  # The address is inside a register.
         (reg.GOAL_POSITION, 1, 2, framing.DATA_LENGTH),
         (reg.TORQUE_ENABLE, 2, 1, framing.DATA_RANGE),
         (reg.BAUD_RATE, 8, 1, framing.DATA_RANGE),
@@ -78,7 +78,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ("instruction", "parameters"),
     [
         (0x77, b""),
-        (0x05, b""),  # No registered write precedes this action.
+        (0x05, b""),  # The action has no registered write.
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )
@@ -123,7 +123,7 @@ def test_protocol_1_if_configured() -> None:
     c = client()
     c.bus.servos[0].table.set(reg.PROTOCOL_TYPE, 1)
     assert c.send(1, framing.PING) == b""
-    # This example is from the e-Manual's page on Protocol 1.0.
+    # The packet is an example from the e-Manual's page on Protocol 1.0.
     asked, answered = bytes.fromhex("FFFF010201FB"), bytes.fromhex("FFFF010200FC")
     assert c.bus.feed(asked, c.t) == answered
     assert c.bus.feed(bytes.fromhex("FFFF020201FA"), c.t) == b""
@@ -134,7 +134,7 @@ def test_protocol_1_if_configured() -> None:
 
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
-    """Return the distance [counts] that a servo moves in ``time`` [s] towards a goal at 300."""
+    """Return the distance [counts] that a servo moves in ``time`` [s] if its goal is at 300."""
     c = client(for_daemon=True)
     for address, value, size in writes:
         assert c.write(address, value, size) == 0
@@ -167,7 +167,7 @@ def test_without_position_gain_or_pwm_the_joint_does_not_move() -> None:
 def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     profile = (reg.PROFILE_VELOCITY, 200, 4)
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
-    # The joint lags behind the profile, so it moves less than at the limit of 20 · 0.229 rpm.
+    # The joint lags behind the profile, so the distance is shorter than at 20 · 0.229 rpm.
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
     c = client()
     for address, value, size in (
@@ -311,7 +311,7 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     ("fault", "bit"), [("overheat=1", 2), ("overload=1", 5), ("undervoltage=1", 0)]
 )
 def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> None:
-    c = client(model="XL330-M288")  # This model's shutdown mask includes all three errors.
+    c = client(model="XL330-M288")  # The model's shutdown mask includes all three errors.
     c.write(reg.TORQUE_ENABLE, 1, 1)
     put_fault(c.bus, fault, c.t)
     c.later(0.02)

@@ -25,22 +25,22 @@ def test_a_grip_outside_the_map_gets_a_warning_with_the_reason():
     text = Envelope(settings(0.002)).warning(10.0)
     assert "object.width = 2 mm, control.tip_friction = 0.6, a mass of 0 kg" in text
     assert "the hand can't grip the object" in text
-    # The map contains a friction of 0.2 and a grip of 10 N that may increase to 20 N. A grip that
-    # may increase less can carry less load.
+    # The map covers a friction of 0.2 and a grip of 10 N whose force may increase to 20 N. If the
+    # force may increase less, the grip can carry less load.
     for load, force, more in ((9.5, 10.0, 10.0), (7.3, 5.0, 10.0), (5.0, 10.0, 0.0)):
         control = {"tip_friction": 0.25, "object_load": load, "grip_raise_max": more}
         assert "slips out" in Envelope(settings(0.040, **control)).warning(force)
     held = settings(0.040, tip_friction=0.25, object_load=4.8)
     assert Envelope(held).warning(10.0) == ""
-    # The map is not valid for another control law or another hand.
+    # The map is valid only for its own control law and hand.
     assert Envelope(settings(0.002, law="upright")).warning(10.0) == ""
     other = Settings.model_validate({"tip": {"radius": 0.015}, "object": {"width": 0.002}})
     assert Envelope(other).warning(10.0) == ""
 
 
 def test_the_warning_considers_both_bounds_of_the_force_increase():
-    # A grip of 10 N that may increase to 20 N can carry this load. A grip that may increase only to
-    # 15 N cannot carry this load.
+    # A grip of 10 N can carry the load if the force may increase to 20 N. If the force may increase
+    # only to 15 N, the grip cannot carry the load.
     control = {"tip_friction": 0.25, "object_load": 4.8}
     assert Envelope(settings(0.040, **control)).warning(10.0) == ""
     for bound in ({"grip_raise_max": 5.0}, {"grip_raise_share": 0.5}):

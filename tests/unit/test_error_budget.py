@@ -1,4 +1,4 @@
-"""Test that the covariance matches all actual errors, even errors that frames do not show."""
+"""Test that the covariance accounts for all errors, even those not visible in frames."""
 
 import itertools
 import math
@@ -57,7 +57,7 @@ def test_correlated_noise_increases_the_covariance(physics, d, theta):
         return float(np.mean(squares)), len(squares) / len(frames)
 
     score, valid = nees(KNOWN)
-    assert 0.8 < score < 1.3  # With 400 frames, the scatter is 0.04.
+    assert 0.8 < score < 1.3  # The mean of 400 frames has a scatter of 0.04.
     assert valid > 0.9
     assert tip != TIP or nees(None)[0] > 5.0
 
@@ -186,8 +186,8 @@ def test_sensor_imperfections_are_covered_or_flagged(name, physics, request):
     known, imperfect = IMPERFECTIONS[name]
     tip = Fingertip(0.020, physics)
     # With 32 frames of three values at each depth, the scatter is ± 0.14. For a solid tip, the
-    # covariance includes the error of the tip data. The simulated frames use the same data, so the
-    # lower limit is smaller.
+    # covariance includes the error of the tip data. The simulated frames use the same tip data, so
+    # the lower limit for solid tips is smaller.
     least, most = (0.6, 1.5) if physics == "springs" else (0.2, 1.5)
     # With spring tips, the error of d due to an offset of 0.5 mm exceeds the estimated uncertainty.
     most = 3.0 if (name, physics) == ("centre", "springs") else most
@@ -289,8 +289,8 @@ def test_errors_match_the_covariance_with_all_declared_imperfections(profile, ph
             forces.append(abs(c.force - true_force) < 1.96 * math.sqrt(variance))
             inside.append(np.abs(error) < 1.96 * np.sqrt(covariance.diagonal()))
     assert len(squares) > 0.6 * frames
-    # All frames of a hand share some errors, which are drawn 60 times. With other seeds, the mean
-    # is 0.63 to 1.1.
+    # All frames of a hand share some errors, which are drawn 60 times. With other random seeds, the
+    # mean ranges from 0.63 to 1.1.
     assert (0.55 if physics == "springs" else 0.35) < np.mean(squares) < 1.3
     assert (np.mean(inside, axis=0) > 0.9).all()
     assert np.mean(forces) > 0.9

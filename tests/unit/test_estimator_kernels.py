@@ -160,7 +160,7 @@ def test_a_board_without_noise_is_not_corrected_for_clipping():
 
 
 def test_noise_clipped_at_zero_raises_the_contact_threshold():
-    # One strong cell, whose neighbours have a sum of 5.1 standard deviations.
+    # One strong cell, with neighbours whose weighted readings sum to 5.1 standard deviations
     frame = np.zeros((44, 44))
     weights = np.outer((1, 2, 2, 2, 1), (1, 2, 2, 2, 1)).astype(float)
     weights[2, 2] = 0.0

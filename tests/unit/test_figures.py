@@ -46,7 +46,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Figure]]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder with the values of the checked figures, written without Matplotlib."""
+    """Write the values of the checked figures without Matplotlib; return their folder."""
     path = tmp_path_factory.mktemp("numbers")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)

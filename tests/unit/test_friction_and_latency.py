@@ -57,8 +57,8 @@ def test_friction_is_measured_by_a_sweep(tmp_path, capsys, friction, more, expec
     assert calibrate("friction", tmp_path) == 0
     told = capsys.readouterr().out
     found = load(tmp_path / "my.toml").control.joint_friction
-    # The additional static friction decreases by a factor of e per 0.12 rad/s. At the velocities of
-    # this test, a tenth of this friction remains.
+    # The additional static friction decreases by a factor of e per 0.12 rad/s. At the test's
+    # velocities, a tenth of the additional friction remains.
     assert found == pytest.approx(expected, abs=2 * COUNT)
     assert f"control.joint_friction = {found:g}" in told
     assert ("at break-away" in told) == (at_rest is not None)
@@ -165,8 +165,8 @@ def test_latency_is_measured_by_a_grip(tmp_path, capsys, profile, latency, hand)
     record_hand(tmp_path / "run.mcap", FORCES, 4.4, profile=path, hand=plant)
     assert calibrate("latency", tmp_path) == 0
     told = capsys.readouterr().out
-    # Cells with a response time of 60 ms hide part of the latency. With all other cells, the error
-    # of the latency is a few ms.
+    # Cells with a response time of 60 ms hide part of the latency. For faster cells, the error of
+    # the latency is a few ms.
     tolerance = 6e-3 if profile == "velostat" else 3e-3
     assert load(tmp_path / "my.toml").tactile.latency == pytest.approx(latency, abs=tolerance)
     assert float(told.split(" ± ")[1].split(" ms")[0]) < 1e3 * tolerance

@@ -65,7 +65,7 @@ def test_moment_arms_are_the_equilibrium_torques_per_force(grasp, delta):
 
 
 def faces(q, d, angle: float, taper: float):
-    """Return the faces' n and t, the tips' centres and Jacobians, and the rolling terms."""
+    """Return both faces' normals and tangents, both tips' centres and Jacobians and rolling terms."""
     n, t = [], []
     for side in (-0.5, 0.5):
         at = angle + side * taper

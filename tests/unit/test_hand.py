@@ -67,9 +67,9 @@ def test_quasi_static_steering_gain(degrees, gain):
 
 def test_load_dependent_friction_equals_the_gear_efficiency():
     # Load-dependent friction is ``share`` times the motor torque and the contact torque. The gears
-    # therefore transmit (1 − share)/(1 + share) of the torque. If the contact drives the gears,
-    # this ratio is inverted. ``rest`` is a constant friction torque [N·m], half of which acts only
-    # at standstill.
+    # therefore transmit (1 − share)/(1 + share) of the torque. If the contact drives the gears, the
+    # ratio is inverted. ``rest`` is a constant friction torque [N·m], half of which acts only at
+    # standstill.
     share, rest = 0.25, 0.02
     simulation = {"joint_friction": 0.5 * rest, "joint_stribeck": 0.5 * rest, "joint_damping": 0.0}
     simulation |= {"joint_load_friction": (0.5 * share, 0.5 * share), "joint_stribeck_speed": 50.0}
@@ -287,8 +287,8 @@ def test_samples_are_interpolated_at_the_frame_times():
     for number in range(hand.sample_count - 5, hand.sample_count):
         sample, exact = hand.sample(number), finer.sample(number)
         assert sample.t == number / 130.0
-        # In each tick, the finger moves by 1e-4 rad and 4e-6 m. Without interpolation, a sample
-        # would have errors of this size.
+        # In each tick, the finger moves by 1e-4 rad and 4e-6 m. Samples that were not interpolated
+        # would have errors of the same size.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
     with pytest.raises(LookupError):

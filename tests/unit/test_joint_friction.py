@@ -182,7 +182,7 @@ SCALE = (PRESLIDING, 0.1, PRESLIDING)
 
 
 def errors(torque: float, rate: float, stribeck: float, counts: Iterable[int]) -> list[float]:
-    """Return, for each number of steps, the maximum error relative to SCALE."""
+    """Return the maximum error relative to SCALE for each number of steps."""
     exact, found = reference(torque, rate, stribeck, SECONDS), []
     for count in counts:
         hand = joint(SECONDS / count, joint_stribeck=stribeck)

@@ -1,4 +1,4 @@
-"""Test each limit, and the conditions under which a limit is reported or latched."""
+"""Test each limit, and the conditions under which a violation is reported or latched."""
 
 import math
 from copy import copy

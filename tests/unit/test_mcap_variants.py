@@ -35,7 +35,7 @@ def golden() -> Iterator[Any]:
 def rewritten(
     path: Path, profile: str = "", others: bool = False, ids: int = 1, prefix: str = "", **options
 ) -> Path:
-    """Rewrite the golden recording with ``ids`` channels per topic; ``others`` adds other topics."""
+    """Rewrite the golden recording with ``ids`` channels per topic; ``others`` adds more topics."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start(profile, "merged")

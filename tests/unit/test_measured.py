@@ -96,7 +96,8 @@ def test_declared_cell_uncertainties_are_part_of_the_errors(law, name, d):
         assert found.valid
         off = np.array([found.d - d, found.tilt_x - theta, found.tilt_y])
         off_by.append(np.abs(off) / np.sqrt(found.covariance.diagonal()[:3]))
-    # With other seeds, the maximum is 1.1 to 1.65 and occurs at the smallest depths.
+    # With other random seeds, the maximum ranges from 1.1 to 1.65 and occurs at the smallest
+    # depths.
     assert 0.5 < np.max(off_by) < 2.0
 
 

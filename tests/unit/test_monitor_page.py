@@ -1,4 +1,4 @@
-"""Test the text of the monitor page for different sizes, streams, states and keys."""
+"""Test the monitor page's text for different page sizes, streams, states and key presses."""
 
 import json
 import math
@@ -204,7 +204,7 @@ def test_the_commander_is_shown_during_its_lease():
     give(feed, b"hand/command", carried_out | {"command": "stop"}, 6.0)
     assert "commands the hand" not in shown(feed, 6.1)
     give(feed, b"hand/command", carried_out | {"client": ""}, 7.0)
-    # The client without a name may be this page.
+    # A client without a name may be the page itself.
     assert "commands the hand" not in shown(feed, 7.1)
     refused = carried_out | {"ok": False, "error": "grasp: arm first", "timestamp": 5.0}
     give(feed, b"hand/command", refused, 8.0)
@@ -289,7 +289,7 @@ def test_key_sequences():
     assert keys.decode(b"D") == ["left"]  # Three reads together form one key sequence.
     keys.decode(b"\x1b")
     keys.settle()
-    assert keys.decode(b"g") == ["g"]  # An earlier Escape does not affect this key.
+    assert keys.decode(b"g") == ["g"]  # The earlier Escape has no effect on the key.
     assert keys.decode(b"a\x1b[200~go") == ["a"]
     assert keys.decode(b"go\x1b[20") == []
     assert keys.decode(b"1~q") == ["q"]

@@ -164,7 +164,7 @@ def pressed(**simulation: float) -> SimulatedHand:
 
 
 def sheared(hand: SimulatedHand, way: list[float]) -> list[float]:
-    """Move the face to each position [m] in ``way``, starting at 0; return T/(μN) at each."""
+    """Move the face from 0 to each position [m] in ``way``; return T/(μN) at each position."""
     found, at = [], 0.0
     for target in way:
         for value in np.linspace(at, target, 400)[1:]:

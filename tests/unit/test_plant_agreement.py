@@ -41,7 +41,7 @@ def length_of(vector):
 
 @dataclass
 class Contact:
-    """Contact of one tip with the object or the other tip, as functions of the coordinates x."""
+    """Contact of a tip with the object or another tip, given by functions of the coordinates x."""
 
     finger: int
     way: Callable  # maps x to the vector from the tip's centre to the point
@@ -79,7 +79,7 @@ class Contact:
 
 
 def material(x, finger, point):
-    """Return the derivatives (2, 5) of the position of a finger's material at ``point``."""
+    """Return the Jacobian (2, 5) of the finger's material point at ``point``."""
     pivot = np.array([-HAND.half_separation, 0.0]) * (1 - 2 * finger)
     lever = point - pivot
     out = np.zeros((2, 5))

@@ -54,7 +54,7 @@ def test_the_json_schema_names_every_field(topic):
 
 
 def test_non_finite_numbers_are_sent_unchanged():
-    state = State()  # Before the first reading, the time is −∞ and the goals of the grip are NaN.
+    state = State()  # Before the first reading, the time is −∞ and the grip goals are NaN.
     assert message_maker(schema.INPUT)(state, (None, None))["reading"]["t"] == -math.inf
     sent = message_maker(schema.STATE)(state, SceneParts((True, True), True, True))
     assert math.isnan(sent["goal_force"])

@@ -219,7 +219,7 @@ def test_crosstalk_is_a_fraction_of_both_line_means():
     signal = counts(sensor(), CONTACTS[1])
     expected = signal + 0.3 * (signal.mean(axis=0) + signal.mean(axis=1)[:, None])
     np.testing.assert_allclose(counts(model, CONTACTS[1]), expected, atol=1.01)
-    assert expected[0].max() > 100.0  # This cell is in a ghost image, away from the contact.
+    assert expected[0].max() > 100.0  # a cell in a ghost image, outside the contact
 
 
 @pytest.mark.parametrize("least", [0, 3])

@@ -1,4 +1,4 @@
-"""Test that the daemon rejects wrong measurements during a grip, so that the force is correct."""
+"""Test that the daemon rejects wrong measurements during a grip and keeps the force correct."""
 
 import math
 from collections.abc import Callable

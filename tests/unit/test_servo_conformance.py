@@ -213,7 +213,7 @@ def test_torque_off_and_close_release_the_joints(make, mode):
 def test_a_finger_outside_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
     if isinstance(rig, DynamixelRig):
-        put_fault(rig.bus, "silent=1", 0.0)  # The backend does not address this servo.
+        put_fault(rig.bus, "silent=1", 0.0)  # The backend does not use servo 1.
     armed(rig)
     reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0

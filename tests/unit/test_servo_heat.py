@@ -193,7 +193,8 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
     ],
 )
 def test_if_the_load_needs_the_force_the_configured_action_is_reported_and_taken(action, mode):
-    # At 24 N, friction can just carry this load, so a smaller force would drop the object.
+    # At 24 N, the friction just carries the load, so the hand would drop the object at a lower
+    # force.
     control = {"object_load": 23.5}
     with hot(24.0, 0.0, control=control, safety={"heat_action": action}) as hand:
         for _ in range(90):

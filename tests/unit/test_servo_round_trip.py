@@ -13,7 +13,7 @@ from tests.harness.servos import RADIAN, DirectPort, make_bus
 ADDRESSES = st.one_of(
     st.sampled_from([7, 11, 64, 65, 98, 100, 102, 104, 108, 116, 126, 132, 168, 224, 578, 634]),
     st.integers(0, 663),
-    st.integers(640, 663),  # Some of these reads extend beyond the end of the table.
+    st.integers(640, 663),  # Some of the reads extend beyond the end of the control table.
 )
 # FF and FD are frequent, because they require stuffing. Small numbers are frequent, because most
 # registers accept them.
@@ -42,7 +42,7 @@ def out_of_reach(address: int, data: bytes) -> bool:
     """Return True if a write could change which servos reply; the test excludes such a write."""
     span = range(address, address + len(data))
     kept = (reg.ID, reg.BAUD_RATE, reg.STATUS_RETURN_LEVEL)
-    # Indirect data could refer to these registers.
+    # Indirect data at 168 and above could refer to the registers in ``kept``.
     return any(a in span for a in kept) or address >= 168
 
 

@@ -191,7 +191,7 @@ def test_shear_of_solid_tips_reveals_a_load(kind):
     watched = at_rest()
     setattr(watched.held, kind, -1.0)
     assert watched.run(0.0, 500) == FORCE
-    setattr(watched.held, kind, -3.5)  # A sudden load of this size exceeds half of the capacity.
+    setattr(watched.held, kind, -3.5)  # The load exceeds half of the friction limit.
     assert watched.run(0.0, 1) == FORCE + 10.0
 
 
@@ -224,7 +224,7 @@ def test_current_noise_is_not_a_load_but_does_not_hide_one(force):
     noise = 0.030 * 1.78 * rng.standard_normal((30_000, 2))
     for tick, pair in enumerate(noise.tolist()):
         watched.held.torque_residual = pair
-        # The load is present before the grip.
+        # The load acts before the grip begins.
         watched.grip.torques(Reading(), ObjectPose(), tick > 500)
         assert watched.grip.target == force
     watched.held.torque_residual = [0.35, 0.35]

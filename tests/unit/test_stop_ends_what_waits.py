@@ -134,7 +134,7 @@ def test_no_request_from_before_a_stop_is_executed(actions):
 
 
 def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
-    """libzmq delivers earlier requests so slowly that the gateway's queue is empty at times."""
+    """libzmq delivers earlier requests so slowly that the gateway's queue is sometimes empty."""
     with played() as scene:
         scene.reading = 1e-5
         scene.stopped_at = 2

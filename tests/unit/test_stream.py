@@ -110,7 +110,7 @@ def test_a_stuck_subscriber_blocks_no_others_and_its_queue_is_bounded(context, a
         for seq in range(10_000):
             state.seq = seq
             publisher.send(STATE, state, BOTH)
-            # This call would never return if it waited for the stuck subscriber.
+            # The call must return, even though one subscriber is stuck.
             served.service.step(0.0)
             while reading.poll(0):
                 reading.recv_multipart()
@@ -189,7 +189,7 @@ def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses,
     grid = np.arange(256 * 256, dtype=np.uint16).reshape(256, 256)
     sensor = SensorInfo(0.002, 0.003, 0.0, 0.0, 0.0, "count", 4.0, False, "")
     served.publisher.settings(98.0, 0.5, facts)
-    served.settle()  # Without this step, the subscriber would receive the message twice.
+    served.settle()  # Send the message before anyone subscribes.
     socket = subscribe(context, addresses[0])
     assert receive(socket, served)[1]["settings"] == facts.settings
     served.publisher.send(TACTILE, Frame(7, 1.0, 1.25, True, grid), grid, 1, sensor, 99.0)
@@ -198,7 +198,7 @@ def test_a_long_message_is_sent_in_pieces_and_received_whole(context, addresses,
 
 def test_commands_are_published_only_to_subscribers(context, addresses, served):
     publisher = served.publisher
-    # Without subscribers, this command is neither sent nor counted.
+    # Without subscribers, a command is neither sent nor counted.
     publisher.command(99.0, 1.0, 500, {"command": "arm"}, "")
     socket = subscribe(context, addresses[0], b"hand/command")
     until(lambda: wanted(served, COMMAND))

@@ -1,4 +1,4 @@
-"""Test the supported variants of Tekscan-style exports, and the messages for other files."""
+"""Test the supported variants of Tekscan-style exports, and the errors for unsupported files."""
 
 import numpy as np
 import pytest

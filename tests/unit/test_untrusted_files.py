@@ -64,7 +64,7 @@ def comments(path: Path) -> None:
     path.write_text("# nothing\n" * 3_000_000)
 
 
-@pytest.mark.timeout(120)  # timeout on a busy machine [s]
+@pytest.mark.timeout(120)  # timeout [s] that suffices on a busy machine
 @pytest.mark.parametrize("make", [fifo, zeros, comments])
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)
 def test_special_files_are_reported(tmp_path, make, read):
@@ -86,7 +86,7 @@ PROFILES = {
 }
 
 
-@pytest.mark.timeout(120)  # timeout on a busy machine [s]
+@pytest.mark.timeout(120)  # timeout [s] that suffices on a busy machine
 @pytest.mark.parametrize("text", PROFILES.values(), ids=PROFILES)
 def test_a_malformed_profile_is_reported_quickly_and_briefly(tmp_path, text):
     path = tmp_path / "my.toml"
@@ -138,7 +138,7 @@ FRAMES: dict[str, tuple[str, Callable[[Path], object]]] = {
 }
 
 
-@pytest.mark.timeout(120)  # timeout on a busy machine [s]
+@pytest.mark.timeout(120)  # timeout [s] that suffices on a busy machine
 @pytest.mark.parametrize(("name", "make"), FRAMES.values(), ids=FRAMES)
 def test_frames_beyond_the_end_of_the_file_are_reported(tmp_path, name, make):
     make(tmp_path / name)

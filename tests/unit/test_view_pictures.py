@@ -136,7 +136,7 @@ def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
     d, theta = held()
     lines = finger_lines(HAND, finger, Q[finger], d[finger], theta[finger])
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
-    outwards = -n if finger == 0 else n  # outward normal of the object at this face
+    outwards = -n if finger == 0 else n  # outward normal of the object's face
 
     def beyond(points: NDArray[np.float64]) -> NDArray[np.float64]:
         distance: NDArray[np.float64] = (points - POSE[:2]) @ outwards - 0.5 * WIDTH_M

@@ -16,7 +16,7 @@ class PulseSettings(Section):
 
 
 class PulsingBoard:
-    """Board that generates frames on demand, one per 1/rate [s]."""
+    """Board that generates frames on demand, one every 1/rate seconds."""
 
     Settings = PulseSettings
 
