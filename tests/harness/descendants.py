@@ -19,7 +19,7 @@ _PR_SET_CHILD_SUBREAPER = 36  # from <linux/prctl.h>
 
 @contextlib.contextmanager
 def ending(process: subprocess.Popen[Any]) -> Iterator[subprocess.Popen[Any]]:
-    """Kill the process on exit; ``with process`` alone would wait for it forever."""
+    """Kill the process on exit; ``with process`` alone would wait for the process forever."""
     with process:
         try:
             yield process

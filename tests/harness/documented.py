@@ -163,7 +163,7 @@ def _await(shown: str) -> int:
 
 
 def _patient_doctor() -> contextlib.ExitStack:
-    """Skip the doctor's address check, and shorten its wake-up measurement."""
+    """Skip the doctor's address check, and shorten the doctor's wake-up measurement."""
     from softfinger.daemon.diagnosis import machine
     from softfinger.tools.setup import doctor
 

@@ -10,9 +10,9 @@
 - the parameters of each simulated plant, which affect transitions between stick and slip.
 
 The change depends only on the number, the position in the array, and SEED, so a repeated
-computation gives the same bits. An array and a single number give different results, and values
-that are equal by symmetry become different. Integers are not changed, because every library
-computes sin 0 and cos 0 exactly.
+computation returns the same bits. Computations with an array and with single numbers therefore
+differ, and so do values that would be equal by symmetry. Integer results are not changed, because
+every library computes values such as cos 0 exactly.
 
 The option does not affect operators (``+``, ``@``), array methods, intermediate results of kernels,
 modules imported within a function, or other processes. `tests.harness.arithmetic` uses another BLAS
@@ -75,7 +75,7 @@ class Perturbation:
         self._wrap(importlib.import_module(_PLANT), "SimulatedHand.__init__", self._moving_plant)
 
     def enter_modules(self) -> None:
-        """Replace `np` and `math` in all imported modules without kernels."""
+        """Replace `np` and `math` in all imported modules that contain no kernels."""
         own = {"np": self._own(np, _NUMPY), "math": self._own(math, _MATH)}
         for name, module in list(sys.modules.items()):
             names = vars(module)

@@ -21,7 +21,7 @@ BOUNDS = SETTINGS.safety
 
 
 class Sensor:
-    """Sensor with the properties that the limits use."""
+    """Sensor with only those properties that the limits read."""
 
     def __init__(self, finger: int) -> None:
         self.finger = finger
@@ -44,7 +44,7 @@ def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> S
 
 
 def sound(mode: Mode = Mode.HOLDING) -> State:
-    """Return a fault-free state with the time 5 s."""
+    """Return a fault-free state whose time is 5 s."""
     state = State(t=5.0, mode=mode, torque=True, seq=10)
     state.reading.t = 5.0
     state.reading.valid = True
@@ -79,7 +79,7 @@ class Deaf:
 
 
 def bounded(judge: Safety, state: State) -> None:
-    """Limit the state's goal as the daemon limits each goal for the servos."""
+    """Limit the state's goal as the daemon does before it sends a goal to the servos."""
     judge.write(cast(Servos, Deaf()), state)
 
 

@@ -75,7 +75,7 @@ def hands(tmp_path: Path) -> Iterator[Callable[..., Hand]]:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Skip the doctor's address check, and shorten its wake-up measurement."""
+    """Skip the doctor's address check, and shorten the doctor's wake-up measurement."""
     monkeypatch.setattr(doctor, "check_addresses", lambda _: [])
     monkeypatch.setattr(machine, "_WAKE_UP_COUNT", 5)
 

@@ -1,15 +1,15 @@
 """Run all shell, Python and profile blocks of the README and the docs unchanged.
 
 Each page runs from top to bottom in its own folder, with one simulated hand. `harness.documented`
-provides the `softfinger` command, which only checks the arguments of endless commands. If a block
-has a title, the block is saved in a file with this name for later blocks. A mark above a block
+provides the `softfinger` command, which only checks the arguments of endless commands. A block with
+a title is saved in a file with the title as its name, for use by later blocks. A mark above a block
 defines an exception:
 
     <!-- not run: why -->                  the block cannot be run, with the reason
     <!-- not run without gymnasium -->     the block needs a package that is not installed here
     <!-- exits 1: why -->                  the last command of the block must fail
 
-A comment after `softfinger status` gives the mode, force and angle for which the test waits.
+A comment after `softfinger status` contains the mode, force and angle that the test waits for.
 """
 
 import contextlib

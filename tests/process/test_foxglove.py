@@ -172,7 +172,7 @@ def check_scene(client: Client) -> None:
 def stranger() -> Iterator[tuple[FakeDaemon, str]]:
     """Yield a fake daemon and the address of its Foxglove server."""
     with FakeDaemon() as fake, served(fake) as (address, _):
-        # Connect once, because otherwise the server warns at exit that no state has arrived.
+        # Connect once; otherwise, the server warns at exit that no state has arrived.
         with connected(address) as line:
             client = Client(line)
             client.subscribe("hand/state")

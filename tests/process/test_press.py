@@ -1,4 +1,4 @@
-"""Test `emulate --send press` and `calibrate` on an emulated hand with rubber tips."""
+"""Test `emulate --send press` and `calibrate` with an emulated hand that has rubber tips."""
 
 import math
 import re

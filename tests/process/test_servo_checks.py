@@ -270,7 +270,7 @@ def test_an_alert_names_the_hardware_error_and_arming_is_refused(bus, servos):
 
 
 class Loaded:
-    """A hand whose joints do not move while its left motor draws 2 A."""
+    """A hand whose joints do not move while the left motor draws 2 A."""
 
     q = dq = np.zeros(2)
     current = np.array([2.0, 0.0])

@@ -1,4 +1,4 @@
-"""Test that a short real-time soak checks the bus, the memory and lost messages."""
+"""Test that a short real-time soak test checks the bus, the memory use and lost messages."""
 
 import copy
 import math

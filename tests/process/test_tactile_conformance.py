@@ -100,7 +100,7 @@ def test_another_grid_is_reported_with_both_sizes(backend, tmp_path):
             rig.sensor.open()
         return "16 × 32" in str(error.value)
 
-    until(told)  # On a busy machine, the board may not have sent anything yet.
+    until(told)  # On a busy machine, the board may still not have sent a frame.
 
 
 @pytest.mark.parametrize("backend", SERIAL)

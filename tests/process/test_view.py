@@ -166,7 +166,7 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
                     page.send(wish)
-                return fake.published > begun + 500  # The queue of a page holds 5 s of pictures.
+                return fake.published > begun + 500  # A page's queue stores 5 s of pictures.
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)

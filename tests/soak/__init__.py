@@ -1,1 +1,1 @@
-"""Soak programs, one per module, which the tests run for a short time."""
+"""Soak tests, one per module; the test suite runs short versions of them."""

@@ -6,7 +6,7 @@ Each run draws a servo model and a room temperature from 15 to 35 °C. The facto
 cooling and heat capacity are 0.75 to 1.33. The current is 1.15 to 1.8 times the maximum continuous
 current. At a random time, the room becomes 5 or 8 °C warmer or colder. The daemon's filter receives
 temperatures in whole degrees and a current with 3 % noise. The plant is `servo_model.servo_joint`.
-``--grips N`` also simulates N complete hands that grip too hard for too long.
+``--grips N`` also simulates N complete hands, each of which grips too hard for too long.
 """
 
 import argparse
@@ -37,7 +37,7 @@ class Foreseen(NamedTuple):
 
 
 class Bench:
-    """Servo with random thermal constants, and the daemon's temperature prediction for it."""
+    """Servo with random thermal constants, and the daemon's prediction of its temperature."""
 
     def __init__(self, seed: int) -> None:
         self.chance = chance = random.Random(seed)

@@ -1,12 +1,12 @@
-"""Run a one-hour real-time hardware-in-the-loop soak: ``python -m tests.soak.hil``.
+"""Run a one-hour real-time soak test with ``python -m tests.soak.hil``.
 
 A daemon process drives an emulated hand. A recorder, three subscribers and a client connect to the
 daemon. The client grasps, turns, moves and releases the object, and streams setpoints at 50 Hz.
-Meanwhile, faults disturb the servos, the boards and the daemon. Every few seconds, the soak checks
-the emulated hand's record of the servo bus. The memory use of each process must not grow, and the
-clients must count all lost messages. Ticks must be as punctual at the end as at the beginning. At
-least three of ten grasps must lead to a hold. The soak counts, reports and clears faults that a
-busy machine causes.
+Meanwhile, faults disturb the servos, the boards and the daemon. Every few seconds, the soak test
+checks the emulated hand's record of the servo bus. The memory use of each process must not grow,
+and the clients must count all lost messages. Ticks must be as punctual at the end as at the
+beginning. At least three out of ten grasps must settle. The soak test counts, reports and clears
+faults that a busy machine causes.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ _FAULT_FOR = 0.3
 _SETPOINT = 0.02  # time between setpoints [s]
 _STREAM = 3.0  # duration of a setpoint stream [s]
 _SPLIT = 300  # duration of a recording file [s]; an open file's index uses memory
-# Faults that leave the object tilted. After one of these faults, the soak puts the object upright.
+# Faults that leave the object tilted. After such a fault, the soak test puts the object upright.
 _ASKEW = ("hand.angle", "tip.tilt")
-_DROPPED = 20.0  # time without a grip after which the soak puts the object back [s]
+_DROPPED = 20.0  # time without a grip after which the soak test puts the object back [s]
 _HELD = 0.3  # minimum fraction of grasps that settle
 _MANY = 50  # number of grasps above which `_HELD` is checked
 _BEGUN = 1500  # maximum difference between the listeners' numbers of states

@@ -1,4 +1,4 @@
-"""Run an emulated hand and its daemon as processes, and inject faults for a soak."""
+"""Run an emulated hand and its daemon as processes, and inject faults for a soak test."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def _stood_still(rig: Rig, chance: random.Random) -> End:
 
 
 def _without_memory(rig: Rig, chance: random.Random) -> End:
-    """Allow the daemon only _ROOM more bytes of address space, and send it requests."""
+    """Allow the daemon only _ROOM more bytes of address space, and send requests to the daemon."""
     assert rig.daemon is not None
     process = rig.daemon.pid
     _, hard = resource.prlimit(process, resource.RLIMIT_AS)

@@ -1,11 +1,11 @@
 """Run random sequences of commands, loads and faults in virtual time, one sequence per seed.
 
 ``python -m tests.soak.virtual`` runs a thousand sequences of 10 s. In most sequences, the hand
-grips the object. The soak then loads, turns and stops the grip, and disturbs it with faulty
-measurements. The daemon is complete except for its sockets. The checks of the requirements use the
-plant's values and the data sent to the servos, not the daemon's own reports. The soak counts how
-often each requirement is checked, and fails if a requirement is never checked. The test suite runs
-only a few sequences.
+grips the object. The soak test then loads, turns and stops the grip, and adds faulty measurements.
+The daemon is complete except for its sockets. Requirements are checked against the plant's values
+and the data sent to the servos, not against the daemon's own reports. The soak test counts the
+checks of each requirement, and fails if a requirement is never checked. The test suite runs only a
+few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time and records the stream.
 Violations are counted and do not end the run. The run fails if memory grows or a state is
@@ -87,7 +87,7 @@ _REMEMBERED = 5.0  # maximum time for which the grip force stays raised after a 
 _RETARGETED = 0.5  # maximum time until a newly requested force applies [s]
 _UNCOVERED = 1.0  # time after a footprint left the object in which false reports are allowed [s]
 
-# Requirements. The soak counts how often each requirement is checked.
+# Requirements. The soak test counts how often each requirement is checked.
 STOPPED = {mode: f"no torque after a stop while {mode}" for mode in ("holding", "rotating")}
 OFF = "no torque after disarm or fault"
 WATCHDOG = "no torque 0.2 s after a stop that no servo hears"
@@ -635,7 +635,7 @@ class Soak:
             self.must(FRAME, age <= most + 1e-9, f"{mode} on one {age:.3f} s old")
 
     def _judge_forces(self, t: float) -> None:
-        """Check that no tip force in the plant exceeds its bound for long."""
+        """Check that no tip force in the plant stays above its bound for over _TOO_LONG seconds."""
         control, most = self.settings.control, self.settings.safety.force_max
         if self._loaded:
             self._loaded_t = t
@@ -726,7 +726,7 @@ def resident() -> float:
 
 
 def sequence(seed: int, ticks: int, account: Account) -> None:
-    """Run the sequence of a seed, and add its violations to ``account``."""
+    """Run the sequence of a seed, and add the violations to ``account``."""
     soak = Soak(seed, account)
     try:
         soak.run(ticks)

@@ -1,4 +1,4 @@
-"""Test the bytes and timestamps of the COBS framing, and its decoder against a reference."""
+"""Test the bytes and timestamps of the COBS framing, and the decoder against a reference."""
 
 import re
 import struct

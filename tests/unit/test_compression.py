@@ -81,7 +81,7 @@ def test_correlated_noise_increases_the_standard_deviation():
         return float(np.mean(np.square(errors)))
 
     smooth = found(np.full(8, 8**-0.5))
-    assert 0.3 < smooth < 3.0  # A fit that ignored the correlation would give 8.
+    assert 0.3 < smooth < 3.0  # Without the correlation, it would be about 8.
 
 
 def test_the_toe_region_is_excluded(monkeypatch):

@@ -35,7 +35,7 @@ def site() -> tuple[ModuleType, dict[str, str]]:
 
 
 def written(text: str) -> str:
-    """Return the text without its code, in which brackets are not links."""
+    """Return the text without code blocks, in which brackets are not links."""
     return re.sub(r"(?ms)^ *```.*?^ *```$|`[^`\n]*`", "", text)
 
 

@@ -1,4 +1,4 @@
-"""Test that invalid frames and arguments give a flagged estimate or a clear error."""
+"""Test that invalid frames and arguments cause a flagged estimate or a clear error."""
 
 import math
 

@@ -198,7 +198,7 @@ def test_compression_with_the_sensor_model(folder: Path) -> None:
         law = columns[f"F of Table I's law at {tilt} deg [N]"]
         expected = np.pi * 0.304 * d**2 / np.cos(np.radians(tilt))
         np.testing.assert_allclose(model, expected, rtol=1e-12)
-        # The sum over the cells is less accurate, but the paper gives only three digits.
+        # The sum over the cells is less accurate, but the paper states only three digits.
         np.testing.assert_allclose(sensed, model, rtol=1e-4)
         # Below full compression, the force is between the forces for the minimum and the maximum
         # modulus.

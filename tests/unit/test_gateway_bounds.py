@@ -97,7 +97,7 @@ def test_unknown_topics_are_not_stored(served, context, addresses):
 def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
     served, context, addresses, clock
 ):
-    """All subscribers receive each repetition, so frequent repetitions would flood them."""
+    """Every subscriber receives each repetition, so repetitions must be limited."""
     served.publisher.event(0.0, 0.0, "info", "test", "told again")
     # Send the event before the first subscription, so that the reader receives it only as a
     # repetition.
@@ -122,7 +122,7 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
 
 
 def test_unread_replies_are_dropped(served, context, addresses):
-    """Unread replies cannot block the gateway or fill its memory, as their queue is limited."""
+    """Unread replies cannot block the gateway or fill the memory, because the queue is limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)

@@ -65,7 +65,7 @@ def test_moment_arms_are_the_equilibrium_torques_per_force(grasp, delta):
 
 
 def faces(q, d, angle: float, taper: float):
-    """Return both faces' normals and tangents, both tips' centres and Jacobians and rolling terms."""
+    """Return normals and tangents of the faces, and centres, Jacobians and rolling terms of tips."""
     n, t = [], []
     for side in (-0.5, 0.5):
         at = angle + side * taper
@@ -133,7 +133,7 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     moments = [p[0] * f[1] - p[1] * f[0] for p, f in zip(touched, forces, strict=True)]
     turning = felt[0][1] + felt[1][1]
     assert sum(moments) == pytest.approx(turning, abs=5e-4 * normal * a)
-    # The virtual work at each face gives the joint torque.
+    # The joint torque follows from the virtual work at each face.
     force = 0.5 * (looked_up[0][0] + looked_up[1][0])
     torque1 = pressed[0] * n[0] @ v[0] + shear[0] * rolls[0] + felt[0][1]
     torque2 = -pressed[1] * n[1] @ v[1] - shear[1] * rolls[1] - felt[1][1]

@@ -36,7 +36,7 @@ def test_the_picture_shows_the_hand_and_its_pressure_maps():
     env.reset(seed=1)
 
     def found(image: np.ndarray, part: str) -> np.ndarray:
-        """Return the mean row and column of the pixels with a part's colour."""
+        """Return the mean row and column of the pixels that have a part's colour."""
         close = np.abs(image[:, :400].astype(int) - COLOURS[part]).max(axis=2) < 8
         assert close.any(), part
         return np.argwhere(close).mean(axis=0)

@@ -1,4 +1,4 @@
-"""Test stress-strain laws from Table I and from measured points, and their tables for kernels."""
+"""Test stress-strain laws from Table I and from measured points, and the laws' kernel tables."""
 
 import math
 from fractions import Fraction
@@ -16,7 +16,7 @@ STRAIN = np.linspace(0.0, 1.0, 201)
 
 
 def laws() -> list[Material]:
-    """Return several laws of different kinds; the last law has a high degree."""
+    """Return stress-strain laws of several kinds; the last law is a polynomial of high degree."""
     x = np.linspace(0.0, 0.8, 30)
     return [
         Material.constant(0.304e6),

@@ -73,7 +73,7 @@ def test_friction_is_a_cone_including_the_lateral_direction(used):
         bears = 2.0 * float(tips.table(d, 0.0).force) / d
         assert slid == pytest.approx(push / bears, rel=1e-3)
         assert data.qpos[2] / data.qpos[1] == pytest.approx(4.0 / 3.0, rel=1e-3)
-    else:  # The remaining push moves the face against 5 N·s/m.
+    else:  # The remaining push moves the face against a damping of 5 N·s/m.
         speed = (push - FRICTION * press) / 5.0
         assert math.hypot(*data.qvel[1:]) == pytest.approx(speed, rel=0.01)
 

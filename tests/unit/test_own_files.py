@@ -1,4 +1,4 @@
-"""Test that softfinger does not use or overwrite files that another user has put at its paths."""
+"""Test that softfinger neither uses nor overwrites another user's files at softfinger's paths."""
 
 import os
 from collections.abc import Callable

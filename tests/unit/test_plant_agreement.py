@@ -1,4 +1,4 @@
-"""Test the plant and its order of convergence against SciPy's adaptive solver.
+"""Test the plant's motion and order of convergence against SciPy's adaptive solver.
 
 The equations of motion are implemented independently, in plain NumPy. The equations assume a
 constant modulus, sticking tips, and damping only in the tips and the palm. The contacts are

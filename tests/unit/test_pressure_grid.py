@@ -1,4 +1,4 @@
-"""Test the forward model's cell averages against integrals, and its sums against closed forms."""
+"""Test the forward model's cell averages against integrals, and cell sums against closed forms."""
 
 import math
 

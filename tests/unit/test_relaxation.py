@@ -73,7 +73,7 @@ def test_pressing_and_releasing_follow_the_prony_terms():
 
 
 def test_relaxing_tips_do_not_generate_energy():
-    """Let a free object bounce between relaxing tips without other damping, until it rests."""
+    """Let a free object bounce between relaxing tips, without other damping, until it stops."""
     settings = Settings.model_validate(
         {
             "material": {"law": "constant"},

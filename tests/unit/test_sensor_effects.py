@@ -210,7 +210,7 @@ def test_offset_drift_has_the_configured_deviation_and_time_constant():
     assert offset.std() == pytest.approx(50.0, rel=0.05)
     earlier = offset.copy()
     sensor_model.drift(offset, 50.0, 60.0, 60.0, rng.standard_normal(offset.shape))
-    # With 3600 cells, the scatter is 0.018.
+    # With 3600 cells, the mean has a scatter of 0.018.
     assert np.mean(offset * earlier) / 50.0**2 == pytest.approx(math.exp(-1), abs=0.08)
 
 

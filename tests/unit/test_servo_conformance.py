@@ -232,7 +232,7 @@ def test_a_model_without_current_sensing_only_supports_position_mode(make, mode)
     assert ticks(rig, Goal(q=[0.08, -0.1]), 0.5)[-1].q == pytest.approx([0.08, -0.1], abs=0.01)
 
 
-# The control loop of current mode, and the checks of position mode.
+# Control loop in current mode, and checks in position mode
 
 
 def test_the_control_loop_of_current_mode():

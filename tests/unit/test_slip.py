@@ -295,7 +295,7 @@ def test_the_force_increase_is_limited_by_its_setting_and_the_force_limit():
 
 
 def test_the_more_loaded_tip_is_not_pressed_beyond_the_force_limit():
-    """A push across the faces, which presses the object into one tip, resembles a twist."""
+    """A push perpendicular to the faces presses the object into one tip and resembles a twist."""
     watched = GripUnderLoad(grip_raise_share=10.0)
     watched.grip.begin_holding()
     watched.held.force = [FORCE - 9.0, FORCE + 9.0]

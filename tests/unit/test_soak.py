@@ -1,4 +1,4 @@
-"""Test that short soak sequences meet all requirements, and that the soak detects violations."""
+"""Test that short sequences meet all requirements, and that the soak test detects violations."""
 
 import math
 from collections.abc import Iterator

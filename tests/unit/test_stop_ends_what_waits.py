@@ -2,8 +2,8 @@
 
 Clients, gateway and loop act one at a time, in an order that Hypothesis chooses. A list contains
 the requests that libzmq has received. The gateway reads only a few of these requests at a time.
-When a stop is executed, a request may therefore still be waiting on its connection, in the gateway,
-on the link, or in the loop.
+When a stop is executed, an earlier request may therefore be waiting on the connection, in the
+gateway, on the link, or in the loop.
 """
 
 import math
