@@ -69,7 +69,7 @@ def other() -> dict[str, str]:
 
 
 def main() -> None:
-    """Replace this process with the command, which runs in the different environment."""
+    """Replace this process with the command, run in the changed environment."""
     variables = other()
     named = " ".join(f"{name}='{value}'" for name, value in variables.items())
     print(f"usual arithmetic: {described()}", f"now with {named}", sep="\n", flush=True)

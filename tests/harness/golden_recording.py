@@ -1,7 +1,7 @@
 """Generate the golden recording of a grasp, a turn, a refused command, a release and a stop.
 
-Run ``python -m tests.harness.golden_recording`` after an intended change in the hand's behaviour.
-The JSON file next to the recording lists the machine and package versions used.
+Run ``python -m tests.harness.golden_recording`` after an intentional change to the hand's
+behaviour. The JSON file next to the recording lists the machine and package versions used.
 """
 
 import json

@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def plugin_path(folder: Path) -> str:
-    """Write the metadata of an installed package to ``folder``; return a PYTHONPATH for it.
+    """Write the metadata of an installed package to ``folder``; return a PYTHONPATH with the folder.
 
     The entry points are taken from pyproject.toml.
     """

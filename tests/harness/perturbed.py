@@ -48,7 +48,7 @@ _PRODUCT = {
 }
 _TABLE = "softfinger.kinematics.contact.table"
 _PLANT = "softfinger.daemon.simulation.physics.simulated_hand"
-_TIMES = ("step", "sample_period")  # parameters that must divide a millisecond exactly
+_TIMES = ("step", "sample_period")  # times that must divide a millisecond exactly
 _KERNELS = (Dispatcher, InnerKernel)
 _SIGN = np.uint64(1 << 63)
 _STEPS = np.array([-1, 0, 0, 1]).astype(np.uint64)

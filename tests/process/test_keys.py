@@ -162,7 +162,7 @@ def guarded(addresses: Addresses, folder: Path) -> Iterator[Guarded]:
 
 @pytest.fixture
 def others() -> Iterator[zmq.Context[Any]]:
-    """Return a context for clients, separate from the daemon's context as in practice."""
+    """Return a context for clients, which is separate from the daemon's context, as in practice."""
     others: zmq.Context[Any] = zmq.Context()
     yield others
     others.destroy(linger=0)

@@ -212,7 +212,7 @@ def test_every_button_reaches_its_mode_and_a_lost_page_frees_the_hand(
         until(lambda: page.text(".reply") == "✓ stop: ok")  # The button was not pressed.
         page.click("[name=tare]")
         until(lambda: page.text(".reply") == "✓ tare: ok")
-        hand.collect(1.0)  # The tare averages these frames.
+        hand.collect(1.0)  # Collect frames for the tare to average.
         press("[name=arm]", "armed")
         press("[name=grasp]", "holding")
         page.click("[name=disarm]")

@@ -230,8 +230,8 @@ CASES: dict[str, Inject] = {
 def judge_wire(rig: Rig) -> str:
     """Return an error found in the emulated hand's record of the servo bus, or "".
 
-    In the record, goals must be within their limits. Torque must not be switched on far from the
-    goal. While torque is on, packets must keep arriving.
+    In the record, goals must be within their limits. Torque must be switched on only near the goal.
+    While torque is on, packets must keep arriving.
     """
     settings = rig.settings
     wrong = ""

@@ -128,7 +128,7 @@ class Judge:
 
 
 class Listener(Link):
-    """Replacement for the gateway, which receives and records all published messages."""
+    """Gateway replacement that receives and records all published messages."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -412,7 +412,7 @@ class Soak:
         self._lie = ""  # kind of the current measurement fault
         self._false: set[str] = set()  # channels that the daemon may report as faulty
         self._loaded = 0.0  # N along the faces
-        # Times [s] of the last load, the last wrong measurement, and the last footprint off the
+        # Times [s] of the last load, the last wrong measurement, and the last footprint outside the
         # object.
         self._loaded_t = self._lied_t = self._uncovered_t = -math.inf
         # Requested forces [N] of the current grip, each with its time [s].

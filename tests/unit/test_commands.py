@@ -383,7 +383,7 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
                     found.append(msgpack.unpackb(stream.recv()))
             return all(len(found) == 20 for found in replies)
 
-        # Receive all setpoints before the loop continues.
+        # Let the gateway receive all setpoints before the loop continues.
         commands = served.service.commands
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
         until(lambda: [served.serve(note), collected()][1])
@@ -534,7 +534,7 @@ def test_flooding_clients_leave_room_for_others(context, addresses):
 
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
-        # Fill the buffers of the gateway.
+        # Send enough to fill the gateway's buffers.
         until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
         other = Asking(context, served, addresses[1], "grasp").socket
         until(lambda: [served.serve(note), other.poll(0)][1])

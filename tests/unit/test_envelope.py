@@ -1,4 +1,4 @@
-"""Test the runs that compute the grip envelope, the stored map, and the warnings of `grasp`."""
+"""Test the computation of the grip envelope, the stored map, and the warnings of `grasp`."""
 
 from typing import Any
 

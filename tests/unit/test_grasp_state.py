@@ -65,7 +65,7 @@ def test_moment_arms_are_the_equilibrium_torques_per_force(grasp, delta):
 
 
 def faces(q, d, angle: float, taper: float):
-    """Return normals and tangents of the faces, and centres, Jacobians and rolling terms of tips."""
+    """Return the faces' normals and tangents, and the tips' centres, Jacobians and roll terms."""
     n, t = [], []
     for side in (-0.5, 0.5):
         at = angle + side * taper

@@ -67,7 +67,7 @@ def test_a_wedge_has_its_origin_at_the_centre_of_mass():
 
 
 def nearest_by_brute_force(corners, point):
-    """Return the vector from ``point`` to the nearest of many points on the outline."""
+    """Return the vector from ``point`` to the nearest of many sampled outline points."""
     share = np.linspace(0, 1, 20_001)[:, None]
     ends = np.roll(corners, -1, axis=0)
     outline = np.concatenate(

@@ -81,8 +81,8 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
         ),
         # An emulator without line timing replies at every baud rate.
         (BOTH, [servo(servo_id, rate) for servo_id in (1, 2) for rate in RATES], []),
-        # If a servo's replies are garbled, the servo is not configured, and its ID is not assigned
-        # to another servo.
+        # If a servo's replies are garbled, the servo is not configured. The servo's ID is not
+        # assigned to another servo.
         (BOTH, [servo(1, 57600), Garbled(1, 57600)], ["missing 0", "missing 1"]),
         (
             BOTH,

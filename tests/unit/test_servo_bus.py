@@ -1,4 +1,4 @@
-"""Test published exchanges, reply rules and line faults on the emulated servo bus."""
+"""Test the emulated servo bus with published packet exchanges, reply rules and line faults."""
 
 import struct
 from typing import Any

@@ -160,7 +160,7 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     assert watched.run(2.0 * FRICTION, 1, speed=GIVES_WAY) == FORCE + 10.0
     state = watched.grip._state
     assert state.grip_force > 1.15 * (FORCE + 10.0), "must take effect on the same tick"
-    # The limit is the force including the error of the torque constant, plus friction and load.
+    # The limit is the force increased by the torque constant's error, plus friction and load.
     most = (FORCE + 10.0) * 1.2 + (0.05 + 0.03 * state.slip.load) / 0.079
     assert state.grip_force <= most + 1e-9
     # Once the measured force has increased, the controller keeps the force set by the reflex.

@@ -15,7 +15,7 @@ from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_alon
 # half the distance of the pivots, finger length, finger offset and tip radius [m]
 LENGTHS = (0.05, 0.08, 0.0, 0.02)
 START = math.radians(5.0)
-DEPTH, FORCE = 0.0032, 10.0  # the paper's tip at this indentation
+DEPTH, FORCE = 0.0032, 10.0  # indentation [m] and force [N] of the paper's tip
 spring_of = upright_spring.py_func
 
 
