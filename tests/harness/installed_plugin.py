@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def plugin_path(folder: Path) -> str:
-    """Write the metadata of an installed package to ``folder``; return a PYTHONPATH with the folder.
+    """Write the metadata of an installed package to ``folder``; return the resulting PYTHONPATH.
 
     The entry points are taken from pyproject.toml.
     """

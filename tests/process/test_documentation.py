@@ -53,7 +53,7 @@ PATIENCE = 300.0  # time limit for one code block [s]
 
 
 class Block(NamedTuple):
-    """Code block on a page; the mark is the comment above the block, and the title is a file name."""
+    """Code block on a page; the mark is the comment above the block; the title is a file name."""
 
     line: int
     language: str

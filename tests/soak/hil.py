@@ -70,7 +70,7 @@ class Account:
     placed: int = 0  # number of times the object was put upright
     # Pairs (received, lost) for each subscriber.
     received: list[tuple[int, int]] = field(default_factory=list)
-    recorded: tuple[int, int] = 0, 0  # number of states in the recorder's files, and number of lost states
+    recorded: tuple[int, int] = 0, 0  # numbers of recorded and lost states
     wrong: list[str] = field(default_factory=list)
     # Private memory of each process at each check [MB].
     memory: dict[str, list[float]] = field(default_factory=dict)

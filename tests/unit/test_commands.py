@@ -534,7 +534,7 @@ def test_flooding_clients_leave_room_for_others(context, addresses):
 
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
-        # Send enough to fill the gateway's buffers.
+        # Let the requests fill the gateway's buffers.
         until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
         other = Asking(context, served, addresses[1], "grasp").socket
         until(lambda: [served.serve(note), other.poll(0)][1])
