@@ -15,7 +15,7 @@ from tests.harness.emulated import HIL, EmulatorProcess
 # True friction [N·m], static friction [N·m] and latency [s] of the hand. The profile has a friction
 # of 0.05 N·m and a latency of 0.015 s.
 FRICTION, AT_REST, LATENCY = 0.09, 0.13, 0.035
-BYTES = 5.13e-3  # duration of a frame on the wire [s]
+BYTES = 5.13e-3  # transmission time of a frame [s]
 COUNT = 1.78 * 2.69e-3  # torque per current count [N·m]
 PLANT = {
     "simulation.joint_friction": FRICTION,

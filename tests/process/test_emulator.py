@@ -205,7 +205,7 @@ def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path,
             apart.append(clock.now() - daemon.now())
     assert max(apart[20:]) - min(apart[20:]) <= 0.0045
     assert daemon.behind > 100 * late or late < 0.002
-    # The hand's clock still advances during the sending of a reply, and after the daemon exits.
+    # The hand's clock still advances while a reply is being sent, and after the daemon exits.
     machine.work(0.01)
     stands = clock.now()
     machine.work(0.01)

@@ -68,7 +68,7 @@ def test_ready_is_sent_first_and_then_four_watchdog_messages_per_interval(manage
 
 def test_a_missing_or_slow_manager_does_not_block_the_daemon(manager):
     service = Service(str(manager.path), watchdog=0.004)
-    for tick in range(5000):  # The socket can buffer far fewer messages.
+    for tick in range(5000):  # far more messages than the socket can buffer
         service.alive(tick * 0.002)
     manager.close()
     service.alive(1e6)

@@ -78,7 +78,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ("instruction", "parameters"),
     [
         (0x77, b""),
-        (0x05, b""),  # The action has no registered write.
+        (0x05, b""),  # The action instruction has no registered write.
         (0x20, b"\x01CTRL"),  # control table backup
     ],
 )

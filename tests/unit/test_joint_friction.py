@@ -18,7 +18,7 @@ COUNT = 2.0 * math.pi / 4096  # one encoder count [rad]
 
 
 def joint(step: float | None = None, **simulation: float) -> SimulatedHand:
-    """Return the left joint at 0 rad without contact."""
+    """Return a hand whose left joint is at 0 rad and has no contact."""
     hand = make(PAPER, step, object_shape="none", **simulation)
     hold_with(hand, (0.0, 0.0))
     place(hand, (0.0, -0.3), (0.0, 0.3, 0.0))

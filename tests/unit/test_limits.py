@@ -227,7 +227,7 @@ def test_a_warning_is_reported_once_until_it_has_ended(name):
 
 @pytest.mark.parametrize(("good", "told"), [(1000, True), (20, True), (3, False)])
 def test_readings_that_fail_for_a_second_are_reported_even_while_disarmed(good, told):
-    """Out of ``good`` readings, one is valid."""
+    """One out of every ``good`` readings is valid."""
     watch, state = safety(), sound(Mode.DISARMED)
     state.torque = False
     first = math.inf

@@ -184,7 +184,7 @@ def test_colours_are_steps_of_the_cube_root_of_energy() -> None:
         np.minimum(root, 1.0), abs=0.6 / (LEVELS - 1.0)
     )
     assert (np.abs(theta) <= TIP.theta_limit(d) + 1e-3).all()
-    assert (shown.levels == LEVELS).any()  # Impossible contacts are drawn, too.
+    assert (shown.levels == LEVELS).any()  # The picture also shows impossible contacts.
 
 
 # Settings of the hand
