@@ -255,8 +255,8 @@ class ObjectState:
     valid: bool = _pose("", "both contacts are valid and determine the pose")
     angle: float = _pose(
         "rad",
-        "object angle in the hand's frame: angle of the bisector between the faces, or of the "
-        "line between the two contacts of a disc",
+        "rotation of the object in the hand's frame, 0 if it is upright: mean rotation of both "
+        "faces, or rotation of the line between the two contacts of a disc",
     )
     width: float = _pose("m", "width of the object between the tips")
     nis_torque: float = _pose(
