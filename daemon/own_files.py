@@ -110,8 +110,8 @@ def home_folder() -> Path:
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:
     """Open a UTF-8 text file at a user-specified path for overwriting or appending.
 
-    Raises OSError like `open`. Raises PermissionError if the path is another user's link, or
-    another user's file in a world-writable folder.
+    Raises OSError like `open`. Raises PermissionError if another user owns the path, and
+    the path is a link or lies in a world-writable folder.
     """
     mode: Literal["a", "w"] = "a" if append else "w"
     return open(path, mode, encoding="utf-8", newline=newline, opener=_open)

@@ -63,7 +63,7 @@ _FRICTION_TOLERANCE = 0.1
 # force within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the
 # settling time of the force in a hand without friction.
 _STUCK_TIME = 2.0
-# A grip counts as empty after the tips have appeared to touch each other for this time [s].
+# A grip counts as empty once the tips have appeared to touch each other for this long [s].
 # _EMPTY_TIME is longer than one frame period at 25 Hz.
 _EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).

@@ -41,7 +41,7 @@ LATENESS_MIN = 0.05  # minimum delay that is reported [s]
 # Minimum time between reports [s]. A report also requires that the total delay has doubled since
 # the previous report.
 REPORT_INTERVAL = 60.0
-ATTRIBUTION_TIME = 0.25  # time after a late tick during which faults may be attributed to it [s]
+ATTRIBUTION_TIME = 0.25  # how long after a late tick a fault is attributed to this tick [s]
 # Limits that a single late tick can violate.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 

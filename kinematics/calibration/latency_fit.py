@@ -43,7 +43,7 @@ def fit_latency(
     latency: float,
     response: float = 0.0,
 ) -> LatencyFit:
-    """Fit the frame delay to the parts (ramps) of a grip in which the force rises or falls.
+    """Fit the frame delay to the ramps of a grip, in which the force rises or falls.
 
     The model for ramp k is
 

@@ -39,7 +39,7 @@ class InnerKernel:
         """Raise TypeError; only kernels can call inner kernels."""
         raise TypeError(
             f"{self.__module__}.{self.__name__} is an inner kernel, which can be called only by "
-            "kernels; decorate it with @kernel to call it from Python"
+            "other kernels; decorate it with @kernel to call it from Python"
         )
 
 

@@ -1,4 +1,4 @@
-"""Test the Python client with a real daemon, and with streams that no real daemon sends."""
+"""Test the Python client against a real daemon, and against streams that no daemon would send."""
 
 import asyncio
 import inspect

@@ -32,7 +32,7 @@ class Guarded(NamedTuple):
 
     folder: Path
     addresses: Addresses
-    recording: Path  # recording that the daemon makes itself
+    recording: Path  # recording made by the daemon
 
 
 @pytest.fixture(scope="module")

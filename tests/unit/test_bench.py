@@ -210,7 +210,7 @@ def test_an_ideal_hand_meets_its_aim():
     (table,) = measure(trials=2, only="6 N: no fault")
     (row,) = table.rows
     assert (row["met"], row["trials"], table.failed) == (2, 2, False)
-    # The errors of the torque constants are up to 10 %.
+    # The torque constants may be off by up to 10 %.
     assert row["lowest"] == pytest.approx(1.0, abs=0.08)
     assert row["peak"] < 1.15
     assert (row["reported"], row["missed"], row["events"]) == ("", "", "")
