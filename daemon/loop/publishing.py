@@ -20,7 +20,7 @@ _STATE, _TACTILE, _STATS, _INPUT, _TRUTH = map(
     bit, (schema.STATE, schema.TACTILE, schema.STATS, schema.INPUT, schema.TRUTH)
 )
 _STATS_RATE = 1.0  # Hz
-_STATS_PHASE = 3  # number of ticks between state and statistics; no tick publishes both
+_STATS_PHASE = 3  # ticks from a state to the statistics, so that no tick publishes both
 
 
 def every(rate: float, wanted: float) -> int:

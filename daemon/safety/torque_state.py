@@ -186,7 +186,7 @@ class TorqueState:
         return silence > 0.0
 
     def _report(self) -> None:
-        """Report once that torque off is unconfirmed, and latch a fault if none is latched."""
+        """Report, only once, that torque off is not confirmed; latch a fault if there is none."""
         if self._reported:
             return
         self._reported = True

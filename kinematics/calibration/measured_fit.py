@@ -132,7 +132,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     force_error, lever_error = max(missed[:2]), max(missed[2:])
     if max(force_error, lever_error / radius) > _CURVE_ERROR_MAX:
         raise CurvesError(
-            "the best smooth increasing curves deviate from the presses by "
+            "the best-fitting smooth, increasing curves differ from the presses by "
             f"{force_error:.1%} in force and {lever_error * 1e3:.2f} mm in centroid position"
         )
     return replace(law, force_error=force_error, lever_error=lever_error)

@@ -120,7 +120,7 @@ def test_a_silent_port_is_reported_with_its_name_and_time_out(own_threads, board
     ):
         tactile.open()
     assert not own_threads()
-    # Once the board sends frames, opening the port must succeed.
+    # Once the board sends frames, the next attempt to open the port must succeed.
     board.stream(lambda k: frame(bytes(1024)))
     tactile.settings = tactile.settings.model_copy(update={"open_timeout": 60.0})
     assert why_not_open(tactile) == ""

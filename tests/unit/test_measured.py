@@ -157,7 +157,7 @@ def test_unsuitable_contacts_are_refused():
         fit_measured(presses(count=5), A, GRID)
     falls = presses()
     softer = [each / (1.0 + (d / 2e-3) ** 3) for each, d in zip(falls.frames, D, strict=True)]
-    with pytest.raises(CurvesError, match="the best smooth increasing curves deviate"):
+    with pytest.raises(CurvesError, match="the best-fitting smooth, increasing curves differ"):
         fit_measured(replace(falls, frames=softer), A, GRID)
     single = replace(falls, frames=[each[:1] for each in falls.frames])
     with pytest.raises(CurvesError, match="five frames for each press"):

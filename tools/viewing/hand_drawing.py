@@ -121,7 +121,7 @@ def held_outline(
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
-    """Return a list with the object's true outline [m], shape [n, 2], or an empty list."""
+    """Return a list that contains the object's true outline ([n, 2] in m), or an empty list."""
     pose = read(TrueState, truth).true_object
     try:
         shape = shape_of(settings)

@@ -55,7 +55,7 @@ _DEGREE = math.degrees(1.0)
 
 
 class _Plot(NamedTuple):
-    """Plot of several lines versus time; ``span`` is the minimum axis range in ``unit``."""
+    """Plot of several signals versus time; ``span`` is the minimum range of the y axis."""
 
     title: str
     unit: str

@@ -89,7 +89,7 @@ class EmulatorClock:
         self.held = False  # True if the deadline limited the last returned time
         self._deadline = deadline
         self._seen = 0.0
-        self._bound = math.inf  # time at which the clock stops until the next deadline
+        self._bound = math.inf  # time at which the clock pauses; a new deadline resumes it
         self._origin = self._last = time.monotonic()
 
     def now(self) -> float:

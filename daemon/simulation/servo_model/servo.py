@@ -1,6 +1,6 @@
 """Emulate a Dynamixel X servo that drives a joint of the plant.
 
-The model includes torque, operating modes, limits, profiles, bus watchdog, hardware errors,
+The model covers torque, operating modes, limits, profiles, the bus watchdog, hardware errors,
 shutdown and reboot. :mod:`simulation.servo_model.servo_bus` handles the packets. PWM mode, which no
 known client uses, is rejected as out of range. The emulator ignores the integral gain. The emulator
 also ignores the option to restore RAM from a backup at startup.
