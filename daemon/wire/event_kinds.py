@@ -130,7 +130,7 @@ KINDS: dict[str, EventKind] = {
     ),
     "servos.bus": EventKind(
         "error",
-        "The port was lost, a servo was stopped by its watchdog, or a servo is rejecting its goals.",
+        "The port was lost, a servo was stopped by its watchdog, or a servo is rejecting goals.",
         "Check the cable and the adapter, then run `softfinger send clear`.",
     ),
     "servos.silent": EventKind(
