@@ -204,7 +204,7 @@ def test_faults_are_parsed():
         ("left:melted", "wrong-size"),
         ("left:drop=0.1", "wrong-size"),
         ("drop", "drop, late, .* =PROBABILITY"),
-        ("middle:torn", "left: or right:"),
+        ("middle:torn", "'left:' or 'right:'"),
         ("push", "push, twist =NUMBER"),
         ("push=inf", "not a number"),
         ("gain", "gain, shift-x, .* =NUMBER"),
