@@ -187,7 +187,7 @@ def shuffled(d, force):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (shuffled, "times in 210 rows, expected rows in test order"),
+        (shuffled, "times in 210 rows, expected rows in measurement order"),
         (lambda d, force: (d[140:], force[140:]), "d only decreases"),
         (lambda d, force: (0 * d, force), "the same displacement"),
         (lambda d, force: (d, 0.003 * force + 0.2), "tip was loaded"),
