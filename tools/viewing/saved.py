@@ -83,12 +83,12 @@ def _moving(scenes: list[tuple[str, list[str]]], period: float) -> str:
     shown = [json.loads(each)["panels"]["hand"]["lines"] for _, kept in scenes for each in kept]
     left, right, top, bottom = (_SCALE * side for side in box)
     # Each line is identified by its colour and by its index among the lines of this colour.
-    lines: dict[tuple[str, int], tuple[float, list[str]]] = {}
+    lines: dict[tuple[str, int], tuple[float, list[list[str]]]] = {}
     for k, drawn in enumerate(shown):
         places: dict[str, int] = {}
         for colour, thick, flat in drawn:
             place = places[colour] = places.get(colour, -1) + 1
-            _, points = lines.setdefault((colour, place), (thick, len(shown) * ["0,0"]))
+            _, points = lines.setdefault((colour, place), (thick, len(shown) * [["0,0"]]))
             points[k] = _points(flat, left, top)
     seconds = f"{period * len(shown):.3g}"
     wide, tall = f"{right - left:.0f}", f"{top - bottom:.0f}"
@@ -97,23 +97,27 @@ def _moving(scenes: list[tuple[str, list[str]]], period: float) -> str:
         f'height="{tall}" color="{_hex("goal")}" fill="none" stroke-linejoin="round">'
     ]
     for (colour, _), (thick, points) in lines.items():
+        # All values have the same number of points, because Chromium mixes lists of different
+        # lengths.
+        count = max(map(len, points))
+        values = [" ".join(each + (count - len(each)) * each[-1:]) for each in points]
         stroke = "currentColor" if colour == "goal" else _hex(colour)
         look = f'stroke="{stroke}" stroke-width="{_SCALE * thick:.3g}"'
-        parts.append(f'<polyline {look} points="{points[-1]}">')
-        if len(set(points)) > 1:
+        parts.append(f'<polyline {look} points="{values[-1]}">')
+        if len(set(values)) > 1:
             parts.append(
                 f'<animate attributeName="points" calcMode="discrete" dur="{seconds}s" '
-                f'repeatCount="indefinite" values="{";".join(points)}"/>'
+                f'repeatCount="indefinite" values="{";".join(values)}"/>'
             )
         parts.append("</polyline>")
     return "\n".join([*parts, "</svg>\n"])
 
 
-def _points(flat: list[float], left: float, top: float) -> str:
+def _points(flat: list[float], left: float, top: float) -> list[str]:
     pairs = list(zip(flat[::2], flat[1::2], strict=True))
     if len(pairs) > _ARC:
         pairs = pairs[::2]
-    return " ".join(f"{_SCALE * x - left:.0f},{top - _SCALE * y:.0f}" for x, y in pairs)
+    return [f"{_SCALE * x - left:.0f},{top - _SCALE * y:.0f}" for x, y in pairs]
 
 
 def _hex(colour: str) -> str:
