@@ -398,7 +398,7 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
         raise CalibrationError("modulus: expected one value of d and one force for each frame")
     used = (depth > 0.0) & (load > 0.0)
     if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
-        raise CalibrationError("modulus: expected at least three frames in contact at different d")
+        raise CalibrationError("modulus: expected at least three contact frames with different d")
     depth, tilt, load = depth[used], tilt[used], load[used]
     if not np.polyfit(depth, load, 1)[0] > 0.0:
         raise CalibrationError("modulus: the force does not increase with d")

@@ -136,8 +136,8 @@ def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:
     if not result.from_start:
         print(
             "the recording starts after the first tick, so the loop's initial state is unknown: "
-            "some recomputed states may differ from the recorded ones, or all if the hand was "
-            "armed; to record every tick, use `run --record`"
+            "some recomputed states (all, if the hand was armed) may differ from the recorded "
+            "ones; to record every tick, use `run --record`"
         )
     for count, what in ((result.missing_ticks, "ticks"), (result.missing_frames, "frames")):
         if count:
