@@ -76,9 +76,9 @@ class EmulatorClock:
     """Clock that measures real time but excludes interruptions of the emulator process.
 
     If the clock continued during an interruption, the emulator would have to simulate the missed
-    time before its next reply. A daemon that can pause its clock on a busy machine sets deadlines for the
-    emulator. While torque is on, the emulator clock and the daemon clock advance by the same amount
-    from one deadline to the next. The emulator clock leads the daemon clock by at most
+    time before its next reply. A daemon that can pause its clock on a busy machine sets deadlines
+    for the emulator. While torque is on, the emulator clock and the daemon clock advance by the
+    same amount from one deadline to the next. The emulator clock leads the daemon clock by at most
     `_AHEAD_TIME`.
     """
 
