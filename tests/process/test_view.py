@@ -230,7 +230,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     for name in ("left", "right"):
         image = picture["panels"][name]["image"]
         levels = np.frombuffer(base64.b64decode(image["data"]), np.uint8).reshape(44, 44)
-        # The 31 levels represent up to 50 kPa, and the peak is 45 kPa.
+        # The 31 levels represent up to 50 kPa, and the peak is 42 kPa.
         assert levels.max() > 20
         assert levels[20:24, 20:24].min() > 10
         assert levels[:8].max() < 6  # cells outside the footprint
