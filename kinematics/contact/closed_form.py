@@ -100,10 +100,10 @@ class Fingertip:
         The result is asin((a − d)/a), or π/2 for d ≤ 0 and 0 for d ≥ a. It is a scalar or an array,
         like ``d``.
         """
-        h = np.clip(self.radius - np.asarray(d, np.float64), 0.0, self.radius)
+        depth = np.clip(np.asarray(d, np.float64), 0.0, self.radius)
+        h = self.radius - depth
         # At the limit, cos θ is the footprint radius divided by a. Unlike asin(h/a), this form is
         # accurate for small d.
-        depth = np.clip(d, 0.0, self.radius)
         limit: FloatArray = np.arctan2(h, np.sqrt(depth * (self.radius + h)))
         return limit
 
@@ -137,10 +137,7 @@ def _real(value: ArrayLike) -> FloatArray:
 
 
 # NaN and infinite inputs result in NaN without a warning.
-_quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
-
-
-@_quiet
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def closed_forms(modulus: float, d: ArrayLike, theta: ArrayLike) -> ClosedForms:
     """Return force, energy and partials for a constant ``modulus`` [Pa].
 

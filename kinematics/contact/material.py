@@ -180,15 +180,14 @@ class Material:
         small strain.
         """
         unit = [value / self.coefficients[0] for value in self.coefficients]
-        secant = unit[1:] or [Fraction(0)]
-        work = [2 * value / (j + 2) for j, value in enumerate(unit[1:], 1)] or [Fraction(0)]
-        tangent = [value * j for j, value in enumerate(unit[1:], 2)] or [Fraction(0)]
-        rows: list[Sequence[Fraction]] = [secant, work, tangent]
+        secant = unit[1:]
+        work = [2 * value / (j + 2) for j, value in enumerate(secant, 1)]
+        tangent = [value * j for j, value in enumerate(secant, 2)]
+        rows = [secant, work, tangent]
         for first in (secant, tangent):
-            second = first[1:] or [Fraction(0)]
-            rows.append(second)
-            rows.append([value * j for j, value in enumerate(second)][1:] or [Fraction(0)])
-        order = max(len(row) for row in rows)
+            second = first[1:]
+            rows += second, [value * j for j, value in enumerate(second)][1:]
+        order = max(len(secant), 1)
         return np.stack([_floats([*row, *[Fraction(0)] * (order - len(row))]) for row in rows])
 
 
@@ -199,10 +198,7 @@ def _evaluate(law: FloatArray, strain: ArrayLike, order: int) -> FloatArray:
     ``strain`` is a number.
     """
     x = np.asarray(strain, dtype=np.float64)
-    u = np.clip(x, 0.0, 1.0)
-    value = law[-1]
-    for term in law[-2::-1]:
-        value = value * u + term
+    value = np.polynomial.polynomial.polyval(np.clip(x, 0.0, 1.0), law)
     if (x > 1.0).any():
         beyond = np.maximum(x - 1.0, 0.0)
         last = np.polynomial.Polynomial(law)

@@ -88,22 +88,21 @@ def fit_law(strain: ArrayLike, stress: ArrayLike) -> tuple[list[Fraction], Float
     top = float(y[-1])
     points, values = _continued(x, y / top)
     weights = np.where(np.arange(points.size) < x.size, 1.0, _EXTENSION_WEIGHT)
-    tried: list[tuple[float, FloatArray]] = []
+    tried: list[tuple[float, FloatArray, FloatArray]] = []
     for degree in _DEGREES:
-        if degree <= max(2 * x.size, 3):
+        if degree <= 2 * x.size:
             modulus = _positive_modulus(points, values, weights, degree)
-            misfit = float(np.max(np.abs(_integrals(x, degree) @ modulus - y / top)))
-            tried.append((misfit, modulus))
-    enough = _MISFIT_RATIO_MAX * min(misfit for misfit, _ in tried) + _NEGLIGIBLE_MISFIT
-    misfit, modulus = next(one for one in tried if one[0] <= enough)
+            misses = np.abs(_integrals(x, degree) @ modulus - y / top)
+            tried.append((float(np.max(misses)), misses, modulus))
+    enough = _MISFIT_RATIO_MAX * min(one[0] for one in tried) + _NEGLIGIBLE_MISFIT
+    misfit, misses, modulus = next(one for one in tried if one[0] <= enough)
     if misfit > _MISFIT_MAX:
         raise MaterialError(
             "no smooth monotonic law fits the points: the best law deviates from the points by up "
             f"to {misfit * top:.4g} Pa (maximum stress: {top:.4g} Pa)"
         )
     rising = _monomials([Fraction(float(value)) * Fraction(top) for value in modulus])
-    misses = np.abs(_integrals(x, len(modulus) - 1) @ modulus - y / top) * top
-    return [value / (j + 1) for j, value in enumerate(rising)], np.stack([x, misses])
+    return [value / (j + 1) for j, value in enumerate(rising)], np.stack([x, misses * top])
 
 
 def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -125,9 +124,7 @@ def _continued(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _positive_modulus(x: FloatArray, y: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
     """Fit the Bernstein coefficients of the modulus to the points, with a positive lower bound."""
     matrix = _integrals(x, degree) * weights[:, None]
-    smooth = np.zeros((max(degree - 1, 0), degree + 1))
-    for i in range(degree - 1):
-        smooth[i, i : i + 3] = 1.0, -2.0, 1.0
+    smooth = np.diff(np.eye(degree + 1), 2, axis=0)
     rows = np.concatenate([matrix, _SMOOTHING * smooth])
     right = np.concatenate([y * weights, np.zeros(len(smooth))])
     floor = _MODULUS_MIN * float(y[-1] / x[-1])

@@ -47,7 +47,7 @@ def gauss_rule(nodes: int = _NODES) -> FloatArray:
 
 def circle_rule(degree: int) -> FloatArray:
     """Return cos χ and sin² χ [2, m] of an equal-weight rule that is exact up to ``degree``."""
-    count = max(1, degree // 2 + 1)
+    count = degree // 2 + 1
     angles = np.pi * (np.arange(count) + 0.5) / count
     return np.stack([np.cos(angles), np.sin(angles) ** 2])
 

@@ -109,7 +109,6 @@ class ContactTable:
     def __init__(self, table: Table) -> None:
         self.header = table
         self.data: Any = table.array
-        self.is_solid = table.is_solid
         self.max_error = table.max_error
 
     def __repr__(self) -> str:
@@ -170,7 +169,7 @@ class ContactTable:
     @property
     def form(self) -> str:
         """Table type: "closed", "springs" with the number of pieces per slab, or "solid"."""
-        if self.is_solid:
+        if self.header.is_solid:
             return "solid"
         return "closed" if self.header.is_closed else f"springs, {self.header.splits} a slab"
 

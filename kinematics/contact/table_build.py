@@ -111,8 +111,7 @@ def _fill(table: Table, material: Material) -> Iterator[_WorstError]:
         h = 0.5 * (low + high) + 0.5 * (high - low) * x
         for split in range(splits):
             y = (split + u) / splits
-            values = _ratios_at(material, h[:, None], y[None, :])
-            terms = _terms(values)
+            terms = _terms(_ratios_at(material, h[:, None], y[None, :]))
             powers = np.einsum(
                 "ai,bj,kij->kba",
                 to_powers(POWERS_V),
@@ -121,20 +120,20 @@ def _fill(table: Table, material: Material) -> Iterator[_WorstError]:
                 optimize=True,
             )
             set_piece(table, slab * splits + split, powers)
-            yield _bound(values, terms * ~mask, h, y)
+            yield _bound(terms, terms * ~mask, h, y)
 
 
-def _bound(values: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -> _WorstError:
+def _bound(terms: FloatArray, lost: FloatArray, h: FloatArray, y: FloatArray) -> _WorstError:
     """Return the bound on a piece's relative error and the approximate location of the maximum.
 
-    ``values`` [5, h, y] are the ratios at the nodes of the piece. ``lost`` contains the Chebyshev
+    ``terms`` [5, i, j] are the Chebyshev coefficients of the ratios. ``lost`` contains the
     coefficients of the difference between ratios and table. The difference is at most the sum of
-    the magnitudes of the coefficients. Higher coefficients are not computed. Each coefficient is
+    the magnitudes of these coefficients. Higher coefficients are not computed. Each coefficient is
     less than half the previous coefficient, because the ratios are analytic well beyond the piece.
     In each direction, the higher coefficients therefore contribute less than twice the last two
     coefficients.
     """
-    everywhere = _dense_nodes(len(h)) @ _terms(values) @ _dense_nodes(len(y)).T
+    everywhere = _dense_nodes(len(h)) @ terms @ _dense_nodes(len(y)).T
     size = np.abs(everywhere)
     size[3] = np.maximum(size[3], size[0])
     smallest = 0.99 * size.min(axis=(1, 2))

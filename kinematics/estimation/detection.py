@@ -103,7 +103,7 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
     signal.is_finite = math.isfinite(total) and math.isfinite(peak)
     signal.peak = peak
     signal.mean = total / max(float(signal.number), 1.0)
-    signal.energy = energy
+    signal.energy = energy * signal.scale * signal.scale
     contact = False
     cell = -1
     level = PEAK_LEVEL * signal.noise
@@ -116,8 +116,7 @@ def activity(state: EstimatorState, frame: FloatArray, height: FloatArray) -> No
             contact = neighbourhood(frame, height, grid, at) > patch
             at = last if contact else next_above(frame, height, at + 1, last, level)
     signal.contact = contact
-    signal.row = cell // grid.cols if cell >= 0 else -1
-    signal.col = cell - signal.row * grid.cols if cell >= 0 else -1
+    signal.cell = cell
 
 
 @inner_kernel
@@ -206,15 +205,15 @@ def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) ->
     """
     rows = state.grid.rows
     cols = state.grid.cols
-    i = state.signal.row
-    j = state.signal.col
+    i = state.signal.cell // cols
+    j = state.signal.cell - i * cols
     total = 0.0
     number = 0
     for k, m in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
         if 0 <= k < rows and 0 <= m < cols and height[k * cols + m] >= 0.0:
             total += frame[k * cols + m]
             number += 1
-    reading = frame[i * cols + j]
+    reading = state.signal.peak
     noise = state.signal.noise
     return bool(
         number > 0
@@ -227,16 +226,10 @@ def _is_outlier(state: EstimatorState, frame: FloatArray, height: FloatArray) ->
 def without_outliers(state: EstimatorState, frame: FloatArray, height: FloatArray) -> int:
     """Mask the outliers, run :func:`activity`, and return the number of outliers."""
     signal = state.signal
-    cols = state.grid.cols
     rejected = 0
     activity(state, frame, height)
-    while (
-        signal.peak > 10.0 * signal.noise + signal.narrow_contact_max
-        and signal.row >= 0
-        and rejected < OUTLIERS_MAX
-        and _is_outlier(state, frame, height)
-    ):
-        height[signal.row * cols + signal.col] = -math.inf
+    while signal.cell >= 0 and rejected < OUTLIERS_MAX and _is_outlier(state, frame, height):
+        height[signal.cell] = -math.inf
         signal.number -= 1
         rejected += 1
         activity(state, frame, height)

@@ -198,7 +198,6 @@ _TOLERANCE = 16.0  # squared ratio of step to noise floor at which the iteration
 # floor. Within 4° of the domain limit, the bias is up to four times the noise floor.
 _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum values of d/a and sin θ in a spring fit
-_STEP_MARGIN = 1.01  # factor by which a solid-tip fit may exceed the range of the data
 # Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
 CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear
@@ -373,11 +372,8 @@ class ContactEstimator:
             pixels, self._rows[SHEAR_X:REACH] = pixels_of(images[:-2]), images[-2:]
             weights = weights_of(tip, material)
             options.deepest, options.sine_max = weights.table.deepest, math.sin(weights.table.tilt)
-            options.step_deepest = _STEP_MARGIN * options.deepest
-            options.step_sine = _STEP_MARGIN * options.sine_max
         else:
-            options.deepest = options.step_deepest = _DEEPEST * tip.radius
-            options.sine_max = options.step_sine = _SINE_MAX
+            options.deepest, options.sine_max = _DEEPEST * tip.radius, _SINE_MAX
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
         points = points_of(cells, material, grid.blur, count_for(cells, fineness))
         # Arguments of the kernel, except the state and the frame.

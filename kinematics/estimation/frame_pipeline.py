@@ -17,7 +17,7 @@ from softfinger.kinematics.estimation.detection import (
     shows_pattern,
     without_outliers,
 )
-from softfinger.kinematics.estimation.gauss_newton import fit, squared_sum
+from softfinger.kinematics.estimation.gauss_newton import fit
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.estimation.moments import start
 from softfinger.kinematics.estimation.state import (
@@ -68,11 +68,8 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
     estimate = state.estimate
     options = state.options
     signal = state.signal
-    energy = squared_sum(state)
     reason = Invalid.NOT_CONVERGED
-    for attempt in range(2):
-        if attempt == 0 and not estimate.has_last_contact:
-            continue
+    for attempt in range(0 if estimate.has_last_contact else 1, 2):
         estimate.has_second_contact = False
         if attempt == 1:
             start(state, frame, cells)
@@ -86,7 +83,7 @@ def _fit_frame(state: EstimatorState, model: Model, frame: FloatArray, cells: Ce
                 continue
             # Search for a second contact only if the misfit exceeds the noise plus a small fraction
             # of the energy. Skip the search for solid tips, which load their whole base.
-            if not options.is_solid and misfit > 8.0 * scatter + 0.003 * energy:
+            if not options.is_solid and misfit > 8.0 * scatter + 0.003 * state.signal.energy:
                 level = max(5.0 * signal.noise, 0.15 * estimate.peak / signal.scale)
                 level += 2.0 * state.budget.baseline / signal.scale
                 estimate.has_second_contact = presses_outside(state, frame, cells.height, level)
@@ -118,7 +115,7 @@ def _set_r_squared(state: EstimatorState) -> tuple[float, float]:
 
     Returns the unexplained part and the scatter of the noise, both in Pa².
     """
-    energy = squared_sum(state)
+    energy = state.signal.energy
     budget = state.budget
     estimate = state.estimate
     number = float(state.signal.number)

@@ -43,6 +43,7 @@ _HALVINGS_MAX = 5
 # Prior standard deviation of a solid tip's shear force, relative to its normal force.
 _SHEAR_PRIOR = 0.1
 _LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
+_STEP_MARGIN = 1.01  # factor by which a solid-tip fit may exceed the range of the data
 # Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
 # by the product of the diagonal elements. The rounding error of a pivot is 1e-12.
 _PIVOT_MIN = 1e-11
@@ -101,13 +102,6 @@ def free_noise(square: float, floor: float) -> float:
     return 2.0 * floor / (low + high)
 
 
-@inner_kernel
-def squared_sum(state: EstimatorState) -> float:
-    """Return the sum of squared readings [Pa²] of all cells."""
-    energy: float = state.signal.energy * state.signal.scale * state.signal.scale
-    return energy
-
-
 @fast_inner_kernel
 def _clip_noise(
     state: EstimatorState, frame: FloatArray, cells: Cells, first: int, last: int
@@ -125,7 +119,7 @@ def _clip_noise(
     clip = math.sqrt(signal.variance)
     number = float(signal.number) - number
     if number >= 16.0:
-        free_square = max(squared_sum(state) - energy * signal.scale * signal.scale, 0.0) / number
+        free_square = max(signal.energy - energy * signal.scale * signal.scale, 0.0) / number
         clip = min(clip, free_noise(free_square, signal.floor))
     return clip
 
@@ -279,14 +273,17 @@ def _apply_step(state: EstimatorState) -> bool:
         contact[i] += fit.step[i]
     contact[GAIN] = max(contact[GAIN], 0.2 * fit.previous[GAIN])
     tilt = math.hypot(contact[TILT_X], contact[TILT_Y])
-    fit.is_limited = tilt > options.step_sine
+    margin = _STEP_MARGIN if options.is_solid else 1.0
+    sine_max = margin * options.sine_max
+    deepest = margin * options.deepest
+    fit.is_limited = tilt > sine_max
     if fit.is_limited:
-        contact[TILT_X] *= options.step_sine / tilt
-        contact[TILT_Y] *= options.step_sine / tilt
+        contact[TILT_X] *= sine_max / tilt
+        contact[TILT_Y] *= sine_max / tilt
     d = contact[DEPTH]
-    fit.is_limited = fit.is_limited or d > options.step_deepest
+    fit.is_limited = fit.is_limited or d > deepest
     least = max(0.3 * fit.previous[DEPTH], 1e-4 * state.grid.radius)
-    contact[DEPTH] = min(max(d, least), options.step_deepest)
+    contact[DEPTH] = min(max(d, least), deepest)
     return bool(d == contact[DEPTH])
 
 
@@ -320,7 +317,7 @@ def _check_fit(state: EstimatorState, cells: Cells) -> float:
             for j in range(PARAMETERS):
                 budget.shared[i, j] += undetected * fit.inverse[i, j]
     if budget.is_correlated:
-        freedom = fit.counted_cells - widen_covariance(state) - (last - first - 4.0)
+        freedom = fit.counted_cells - widen_covariance(state) - (last - SHEAR_X)
     freedom = max(freedom, 1.0)
     estimate.chi2 = misfit / (variance * freedom + expected)
     excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.cells_per_sample / freedom), 1.0)
@@ -387,24 +384,22 @@ def fit(
     before = math.inf
     halvings = 0
     limited = 0
-    solved = False
     for iteration in range(_ITERATIONS):
         cost = linearise(state, model, frame, cells)
-        if solved and not cost <= before + variance and halvings < _HALVINGS_MAX:
+        if iteration > 0 and not cost <= before + variance and halvings < _HALVINGS_MAX:
             # Halve the step, because the cost has increased.
             for i in range(PARAMETERS):
                 fit.contact[i] = 0.5 * (fit.contact[i] + fit.previous[i])
             halvings += 1
             continue
         before = cost
-        solved = solve(fit, first, last)
-        if not solved:
+        if not solve(fit, first, last):
             return False
         halvings = 0
-        kept = not _apply_step(state)
+        is_free = _apply_step(state)
         limited = limited + 1 if fit.is_limited else 0
         if limited == _LIMITED_MAX:
             return False
-        if fit.decrement <= tolerance * variance and not kept:
+        if fit.decrement <= tolerance * variance and is_free:
             return _finish(state, model, cells, iteration + 1)
     return False

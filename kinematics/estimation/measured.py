@@ -148,7 +148,7 @@ class MeasuredEstimator:
         readings = float(pascal_per_count) * frame.ravel()[self._used].astype(np.float64)
         finite = bool(np.isfinite(readings).all())
         sums = self._weights[:, self._used] @ readings - self._zero_sums
-        result.peak = max(float(readings.max(initial=0.0)), 0.0) if finite else 0.0
+        result.peak = float(readings.max(initial=0.0)) if finite else 0.0
         result.contact = finite and bool(sums[0] > self._contact_threshold)
         result.d = result.tilt_x = result.tilt_y = 0.0
         result.covariance[:] = result.systematic[:] = 0.0

@@ -97,7 +97,7 @@ def start(state: EstimatorState, frame: FloatArray, cells: Cells) -> None:
             _select_above(frame, cells, max(4.0 * signal.noise, 0.15 * signal.peak))
         _set_moments(m, frame, cells)
         if not m.total > 0.0:
-            at = signal.row * state.grid.cols + signal.col
+            at = signal.cell
             m.x, m.y, m.number = cells.x[at], cells.y[at], 1.0
         # In a weak contact, about three quarters of the pressed cells exceed the threshold.
         _set_from_area(state, 1.3 * m.number if weak else m.number)

@@ -39,8 +39,6 @@ class Options(Record):
     is_solid: bool
     deepest: float  # maximum d of the model [m]
     sine_max: float  # sine of the model's maximum tilt
-    step_deepest: float  # limits during the iteration: d [m] and the sine of the tilt
-    step_sine: float
 
 
 class Signal(Record):
@@ -54,11 +52,10 @@ class Signal(Record):
     saturation: float  # [Pa]
     floor: float  # [Pa]; −inf without a floor
     number: int  # number of cells that a contact can load, excluding outliers
-    peak: float  # largest reading [counts]; row and col are −1 if the peak is below the level
-    row: int
-    col: int
+    peak: float  # largest reading [counts]
+    cell: int  # cell of the peak, or −1 if the peak is below the level
     mean: float  # [counts]
-    energy: float  # Σ p² [counts²]
+    energy: float  # Σ p² [Pa²]
     is_clipped: bool  # True if readings are clipped at the floor
     contact: bool
     is_finite: bool

@@ -40,6 +40,23 @@ def clean(truth: tuple[float, float, float]) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("exact_solid_data")
+@pytest.mark.parametrize(
+    ("physics", "free_gain"), [("springs", True), ("springs", False), ("solid", False)]
+)
+def test_white_noise_described_as_a_correlation_gives_the_same_chi2(physics, free_gain):
+    """A wrong number of degrees of freedom would change chi2 by 1 in some 600 cells."""
+    tip = Fingertip(0.020, physics)
+    frame = GRID.pressure(tip, LINEAR, 0.004, 0.1, -0.05)
+    frame += np.random.default_rng(13).normal(0.0, NOISE, frame.shape)
+    plain, described = (
+        ContactEstimator(tip, LINEAR, GRID, NOISE, free_gain=free_gain, known=known)(frame)
+        for known in (None, Uncertainty(correlation=np.ones((1, 1))))
+    )
+    assert described.chi2 == pytest.approx(plain.chi2, rel=1e-5)
+    np.testing.assert_allclose(described.covariance, plain.covariance, rtol=1e-6, atol=1e-20)
+
+
+@pytest.mark.usefixtures("exact_solid_data")
 @pytest.mark.parametrize(("d", "theta"), [(0.001, 0.0), (0.002, 0.4), (0.006, 0.2)])
 @pytest.mark.parametrize("physics", ["springs", "solid"])
 def test_correlated_noise_increases_the_covariance(physics, d, theta):

@@ -48,7 +48,7 @@ def test_activity_matches_plain_numpy():
     state = EstimatorState()
     grid = state.grid
     grid.radius, grid.pitch_x, grid.pitch_y, grid.rows, grid.cols = 1.0, 0.01, 0.01, 20, 24
-    state.signal.patch_level, state.signal.noise = 4.0, 1.0
+    state.signal.patch_level, state.signal.noise, state.signal.scale = 4.0, 1.0, 1.0
     height, _, _ = cell_centres(grid, active, 2.0)
     state.signal.number = int((height >= 0.0).sum())
     assert state.signal.number == active.sum()
@@ -72,7 +72,7 @@ def test_activity_matches_plain_numpy():
         assert found.energy == pytest.approx((inner**2).sum())
         assert found.peak == inner.max()
         if found.peak > 3.0:
-            assert frame[found.row, found.col] == found.peak
+            assert frame.flat[found.cell] == found.peak
         seen.add(expected)
     assert seen == {True, False}
 
