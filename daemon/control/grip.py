@@ -88,11 +88,6 @@ class Grip:
         return self.force.target
 
     @property
-    def has_slipped(self) -> bool:
-        """True if the object has rotated in the grip on this tick."""
-        return self.slip.has_turned
-
-    @property
     def is_blind(self) -> bool:
         """True if the control law does not use the object angle."""
         return self._state.law.is_blind
@@ -111,11 +106,6 @@ class Grip:
         if speed * angle <= 0.0:
             return 0.0
         return 1.0 + min(speed * self._control.smooth_time / angle, 1.0)
-
-    @property
-    def is_turning(self) -> bool:
-        """True while the setpoint of the object angle is moving to its target."""
-        return self._state.is_steering and self.angle.value != self.target_angle
 
     def start(self, measured: float, force: float) -> None:
         """Begin the grip at the ``measured`` force [N], then change the force to ``force`` [N]."""

@@ -26,7 +26,6 @@ _TORQUE_ERROR_SIGMA = 2.0  # force margin, in standard deviations of the torque 
 _INTEGRAL_RATIO = 0.3  # limit of the integral term, as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
 _DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation while the tip forces are equalised [rad]
-_DITHER_STEP_MAX = 0.05  # maximum time step of the dither, even after a late tick [s]
 _STIFFNESS_MIN = 100.0  # lower limit of the stiffness, which is used as a divisor [N/m]
 ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
 
@@ -135,17 +134,18 @@ def grip_torques(
     limit = _force_limit(g, grasp.load_arm * g.slip.load, mean(grasp.moment_arm))
     bound = _INTEGRAL_RATIO * g.force.target
     g.grip_force = _grip_force(g, target, mean(grasp.force), bound, limit)
-    if g.law.is_blind and not g.is_steering:
-        return _equal_torques(g, grasp, target, dq)
-    offset_rate = 0.0
+    g.offset_rate = 0.0
     if g.is_steering:
-        offset_rate = _steer(g, angle_windows, grasp, angle)
-    g.offset_rate = offset_rate
-    if setpoint.has_arrived(g.force) and not (g.is_steering and not setpoint.has_arrived(g.angle)):
+        g.offset_rate = _steer(g, angle_windows, grasp, angle)
+    is_upright = g.law.is_blind and not g.is_steering
+    is_turning = g.is_steering and not setpoint.has_arrived(g.angle)
+    if setpoint.has_arrived(g.force) and not (is_upright or is_turning):
         _distribute(g, grasp)
-    closing_rate = _closing_rate(grasp, g.force.speed, offset_rate)
+    closing_rate = _closing_rate(g, grasp, g.force.speed)
     g.closing_friction = clip(closing_rate / g.law.friction_speed, 1.0)
-    return _torques(g, grasp, closing_rate, offset_rate, dq)
+    if is_upright:
+        return _equal_torques(g, grasp, target, closing_rate, dq)
+    return _torques(g, grasp, closing_rate, dq)
 
 
 @kernel
@@ -159,7 +159,7 @@ def hold_goal(
     g = grips[0]
     g.offset_rate *= g.law.turn_decay
     g.offset += g.offset_rate * g.law.dt
-    return _torques(g, grasps[0], _closing_rate(grasps[0], 0.0, g.offset_rate), g.offset_rate, dq)
+    return _torques(g, grasps[0], _closing_rate(g, grasps[0], 0.0), dq)
 
 
 @kernel
@@ -283,7 +283,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
 
 @inner_kernel
-def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
+def _closing_rate(g: GripState, grasp: GraspState, rate: float) -> float:
     """Return the closing rate [rad/s] that changes the force at ``rate`` [N/s].
 
     The closing rate also compensates for a rotation of the object.
@@ -291,18 +291,14 @@ def _closing_rate(grasp: GraspState, rate: float, offset_rate: float) -> float:
     arm = grasp.moment_arm
     rotation = grasp.jacobian_rotation
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
-    d_rate -= (arm[0] - arm[1] + grasp.jacobian_slide * (rotation[0] + rotation[1])) * offset_rate
+    d_rate -= (arm[0] - arm[1] + grasp.jacobian_slide * (rotation[0] + rotation[1])) * g.offset_rate
     closing: float = d_rate / (arm[0] + arm[1])
     return closing
 
 
 @inner_kernel
 def _torques(
-    g: GripState,
-    grasp: GraspState,
-    closing_rate: float,
-    offset_rate: float,
-    dq: tuple[float, float],
+    g: GripState, grasp: GraspState, closing_rate: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
     """Return both joint torques for the commanded closing and offset rates [rad/s]."""
     law = g.law
@@ -311,11 +307,11 @@ def _torques(
     damping *= closing_rate - 0.5 * (dq[0] + dq[1])
     error = g.offset - 0.5 * (grasp.q[0] - grasp.q[1])
     steering = g.joint_stiffness * error
-    steering += law.damping * math.sqrt(g.joint_stiffness) * (offset_rate - 0.5 * (dq[0] - dq[1]))
+    steering += law.damping * math.sqrt(g.joint_stiffness) * (g.offset_rate - 0.5 * (dq[0] - dq[1]))
     arms = grasp.moment_arm if law.is_blind else grasp.energy_arm
     for k in range(2):
         sense = 1.0 - 2.0 * k
-        rate = closing_rate + sense * offset_rate
+        rate = closing_rate + sense * g.offset_rate
         motor_torque = _motor_torque(law, arms[k] * g.grip_force, rate)
         g.torque[k] = motor_torque + damping + sense * steering + _friction(law, rate)
     return g.torque[0], g.torque[1]
@@ -323,16 +319,13 @@ def _torques(
 
 @inner_kernel
 def _equal_torques(
-    g: GripState, grasp: GraspState, target: float, dq: tuple[float, float]
+    g: GripState, grasp: GraspState, target: float, closing_rate: float, dq: tuple[float, float]
 ) -> tuple[float, float]:
     """Return joint torques at which both tips push with equal force at any object angle.
 
     After the dither, the joints hold the antisymmetric angle (q1 − q2)/2.
     """
     law, q = g.law, grasp.q
-    closing_rate = _closing_rate(grasp, g.force.speed, 0.0)
-    g.offset_rate = 0.0
-    g.closing_friction = clip(closing_rate / law.friction_speed, 1.0)
     closed = mean(q)
     arm = law.length * math.cos(closed) - law.offset * math.sin(closed)
     damping = _damping(law, _mean_stiffness(grasp), arm)
@@ -372,7 +365,9 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     if g.dither_elapsed > 0.0 or setpoint.has_arrived(g.force):
         # Measure the time with the clock. If ticks are late, counting ticks would slow the dither.
         # A slow dither could excite the resonance of the fingers on the soft tips at 1 to 2 Hz.
-        g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), _DITHER_STEP_MAX)
+        # Even a very late tick advances the dither by at most a quarter of its period.
+        quarter_period = 0.5 * math.pi / law.dither_rate
+        g.dither_elapsed += min(max(grasp.t - g.last_time, 0.0), quarter_period)
     torque: float = amplitude * law.dither_torque * math.sin(phase) - spring * antisymmetric
     return torque
 

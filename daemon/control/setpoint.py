@@ -29,7 +29,7 @@ class SetpointState(Record):
     value: float
     speed: float  # [1/s]
     ramp: float  # unsmoothed value, which approaches the target at a constant rate
-    idle_count: int  # number of ticks since the ramp reached the target
+    pending_count: int  # number of ticks until the running means have settled
     dt: float  # [s]
     first: RunningMean
     second: RunningMean
@@ -40,7 +40,7 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
     """Set the setpoint to ``value``, and set its speed to zero."""
     s.target = s.ramp = s.value = value
     s.speed = 0.0
-    s.idle_count = s.first.length + s.second.length
+    s.pending_count = 0
     s.first.index = 0
     s.second.index = 0
     s.first.sum = value * s.first.length
@@ -51,7 +51,7 @@ def reset(s: SetpointState, windows: FloatArray, value: float) -> None:
 @inner_kernel
 def has_arrived(s: SetpointState) -> bool:
     """Return True if the setpoint has reached its target and stopped."""
-    there: bool = s.idle_count >= s.first.length + s.second.length and s.ramp == s.target
+    there: bool = s.pending_count == 0 and s.ramp == s.target
     return there
 
 
@@ -72,16 +72,15 @@ def advance(s: SetpointState, windows: FloatArray, rate: float) -> float:
     remaining = s.target - s.ramp
     last = s.value
     if remaining == 0.0:
-        length = s.first.length + s.second.length
-        if s.idle_count >= length:
+        if s.pending_count == 0:
             return last
-        s.idle_count += 1
-        if s.idle_count >= length:
+        s.pending_count -= 1
+        if s.pending_count == 0:
             reset(s, windows, s.target)  # Remove accumulated rounding errors.
             return s.target
     else:
         step_max = rate * s.dt
-        s.idle_count = 0
+        s.pending_count = s.first.length + s.second.length
         if abs(remaining) <= step_max:
             s.ramp = s.target
         else:

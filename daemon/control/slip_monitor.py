@@ -171,7 +171,6 @@ def begin(s: SlipState, grasp: GraspState) -> None:
         s.offset = mean(s.residual)
         s.start_offset = s.offset - clip(s.offset, s.friction)
     s.moment = moment
-    s.rotation_seen[:] = grasp.unexplained_rotation
     s.rotation[:] = 0.0
     s.q[:] = grasp.q
     s.holding_time = _AVERAGE_TIME
@@ -297,8 +296,7 @@ def _force_limit(s: SlipState, commanded: float, declared: float) -> float:
     law = s.law
     share = law.increase_ratio if s.is_confirmed else min(law.increase_ratio, _UNCONFIRMED_SHARE)
     increase = min(max(share * commanded, declared - commanded), law.increase_ratio * commanded)
-    limit = min(commanded + min(increase, law.increase_max), s.balanced_max)
-    return max(limit, commanded)
+    return min(commanded + min(increase, law.increase_max), s.balanced_max)
 
 
 @inner_kernel

@@ -523,13 +523,13 @@ class Control:
     def _report_increase(self, history: GripHistory) -> None:
         """Report slip, and report the start of each force increase."""
         grip = self.grip
-        if grip.has_slipped:
+        if grip.slip.has_turned:
             self._warn("slip", "the object is rotating in the grip")
         if grip.target <= grip.commanded:
             history.increase_reported = False
         elif not history.increase_reported and grip.target > (1 + _FORCE_NOISE) * grip.commanded:
             history.increase_reported = True
-            why = "the object rotates" if grip.has_slipped else "sudden load"
+            why = "the object rotates" if grip.slip.has_turned else "sudden load"
             if grip.slip.assumed_load > 0.0:
                 why = (
                     f"the load may reach {grip.slip.assumed_load:.1f} N along the object's face "

@@ -11,7 +11,7 @@ import math
 import os
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -269,12 +269,11 @@ class Converter:
             )
 
     def __call__(self, counts: NDArray[np.uint16]) -> FloatArray:
-        """Convert counts [rows, cols] to pressures [Pa]."""
-        return self.pressure(self.readings(counts))
+        """Convert counts [rows, cols] to pressures [Pa].
 
-    def readings(self, counts: NDArray[Any]) -> FloatArray:
-        """Return the argument of the calibration curve, x = max(counts − zero, 0)·gain."""
-        return np.asarray(np.maximum(counts - self.zero, 0.0) * self.gain)
+        The argument of the calibration curve is x = max(counts − zero, 0)·gain.
+        """
+        return self.pressure(np.maximum(counts - self.zero, 0.0) * self.gain)
 
     def pressure(self, readings: FloatArray) -> FloatArray:
         """Convert readings to pressure [Pa].

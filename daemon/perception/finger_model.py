@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.perception.calibration_file import Calibration, Converter, calibration_for
-from softfinger.daemon.perception.prior import CALIBRATED_ERROR, MODULUS_ERROR, UNKNOWN, Prior
+from softfinger.daemon.perception.prior import CALIBRATED_ERROR, MODULUS_ERROR, Prior
 from softfinger.daemon.profile.factory import (
     law_problem,
     make_grid,
@@ -39,8 +39,8 @@ class FingerModel:
     material: Material
     table: ContactTable
     grid: SensorGrid
-    calibration: Calibration | None = None
-    prior: Prior = UNKNOWN
+    calibration: Calibration | None
+    prior: Prior
 
     @property
     def own_material(self) -> bool:
@@ -86,7 +86,7 @@ def make_models(
                 common = law, make_table(settings, law)
             material, table = common
         grid = calibrated_grid(settings, finger, calibration)
-        prior = _prior(settings, calibration)
+        prior = make_prior(settings, calibration)
         made[finger] = FingerModel(finger, material, table, grid, calibration, prior)
         if calibration is not None and on_event is not None:
             on_event("info", "calibration", f"{name}: {calibration.summary()}")
@@ -101,7 +101,7 @@ def make_models(
     return left, right
 
 
-def _prior(settings: Settings, calibration: Calibration | None) -> Prior:
+def make_prior(settings: Settings, calibration: Calibration | None) -> Prior:
     """Return a finger's prior, either from a run of `calibrate scales` or from the settings."""
     if calibration is not None and calibration.scales is not None:
         found = calibration.scales

@@ -21,14 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.daemon.perception.grasp import AMPLITUDE, ANGLE_CHANNEL, FOOTPRINT
 from softfinger.daemon.perception.hand_state import (
-    AMPLITUDE,
     ANGLE,
     ANGLE_BIAS,
-    ANGLE_CHANNEL,
     D_BIAS,
     ENCODER,
-    FOOTPRINT,
     FRICTION,
     GAIN,
     GATE,
@@ -48,7 +46,7 @@ from softfinger.daemon.perception.hand_state import (
     predicted_variance,
     reset,
     reset_all,
-    walk_pair,
+    shift_sideways,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
@@ -246,9 +244,8 @@ def update(
         and not cells_respond
         and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN
     ):
-        h.grasp.angle_jump[finger] = angle_innovation
-        h.grasp.d_jump[finger] = d_innovation if is_fitted else 0.0
-        if _is_rejected(h, finger, sense, scan, theta_noise, d_noise):
+        jump = (angle_innovation, d_innovation if is_fitted else 0.0)
+        if _is_rejected(h, finger, sense, scan, jump, (theta_noise, d_noise)):
             return False
     tip.tilt_y = found.tilt_y
     tip.gain_is_fixed = not (is_fitted or h.gain_is_known)
@@ -379,15 +376,15 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
     """Update the state with the footprint channel, whose derivatives are in `slopes`.
 
     If the innovations of the two tips have opposite signs, a large innovation means that the object
-    has moved sideways. If the signs are equal and the gain is fixed, a large innovation means that
-    the sensor gain has changed.
+    has been pushed sideways. If the signs are equal and the gain is fixed, a large innovation means
+    that the sensor gain has changed.
     """
     d_innovation = innovation / h.slopes[D + finger]
     other = h.tip[1 - finger].d_innovation
     h.tip[finger].d_innovation = d_innovation
     if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
         if d_innovation * other < 0.0:
-            walk_pair(h, D, 0.0, min(abs(d_innovation), abs(other)), 1.0)
+            shift_sideways(h, min(abs(d_innovation), abs(other)) ** 2)
         elif h.tip[finger].gain_is_fixed:
             h.covariance[GAIN + finger, GAIN + finger] += innovation * innovation
     correct(h, FOOTPRINT + finger, innovation, noise, GATE)
@@ -395,10 +392,11 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
 
 @inner_kernel
 def _is_rejected(
-    h: HandFilter, finger: int, sense: float, scan: Scan, theta_noise: float, d_noise: float
+    h: HandFilter, finger: int, sense: float, scan: Scan, jump: FloatPair, noise: FloatPair
 ) -> bool:
     """Return True if a frame of a held object is an outlier, and count consecutive outliers.
 
+    ``jump`` contains the innovations of angle and d, and ``noise`` contains the noise variances.
     A jump in angle or displacement is an outlier unless the other tip or the joints confirm the
     jump. A rotation is accepted if both tips show the rotation while the joints are moving. If the
     joints are at rest, the rotation must also continue in the next frame. A displacement is
@@ -410,19 +408,19 @@ def _is_rejected(
     tip = h.tip[finger]
     other = 1 - finger
     _set_angle_slopes(h, finger, sense, scan.theta_rate)
-    angle_std = math.sqrt(predicted_variance(h) + theta_noise)
+    angle_std = math.sqrt(predicted_variance(h) + noise[0])
     h.slopes[:] = 0.0
     _set_d_slopes(h, finger, 1.0, 1.0, scan.d_rate)
-    d_std = math.sqrt(predicted_variance(h) + d_noise)
+    d_std = math.sqrt(predicted_variance(h) + noise[1])
     h.slopes[:] = 0.0
-    angle = grasp.angle_jump[finger]
-    d = grasp.d_jump[finger]
+    angle, d = jump
     angle_jumps = abs(angle) > max(2.0 * IMAGE_SHIFT_MIN, OUTLIER_GATE * angle_std)
     d_jumps = abs(d) > max(IMAGE_SHIFT_MIN * h.radius, OUTLIER_GATE * d_std)
     # The threshold is two velocity units per joint.
     joints_move = abs(tip.speed) + abs(h.tip[other].speed) > 4.0 * h.velocity_unit
-    continues = tip.rejected_count > 0 and abs(angle - tip.last_angle_jump) > IMAGE_SHIFT_MIN
-    tip.last_angle_jump = angle
+    continues = tip.rejected_count > 0 and abs(angle - grasp.angle_jump[finger]) > IMAGE_SHIFT_MIN
+    grasp.angle_jump[finger] = angle
+    grasp.d_jump[finger] = d
     angle_agrees = angle * grasp.angle_jump[other] > _JUMP_SUPPORT * angle * angle
     d_agrees = abs(grasp.d_jump[other]) >= _JUMP_SUPPORT * abs(d)
     is_rejected: bool = (angle_jumps and not (angle_agrees and (joints_move or continues))) or (

@@ -9,18 +9,10 @@ from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.layout import Pair, Record
 
-CHANNELS = (
-    "angle, left",
-    "angle, right",
-    "footprint, left",
-    "footprint, right",
-    "amplitude, left",
-    "amplitude, right",
-    "encoder, left",
-    "encoder, right",
-    "torque",
-    "balance",
-)
+# Index of each measurement channel in `GraspState.nis`. For the first four channels, each name is
+# the index for the left tip. The next index is for the right tip.
+ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES = range(0, 10, 2)
+BALANCE, CHANNELS = 9, 10
 
 
 class GraspState(Record):
@@ -57,14 +49,12 @@ class GraspState(Record):
     unexplained_rotation: Pair  # accumulated object rotation not explained by joint motion [rad]
 
     # Consistency
-    nis: Annotated[NDArray[np.float64], len(CHANNELS)]  # running averages; the expected value is 1
+    nis: Annotated[NDArray[np.float64], CHANNELS]  # running averages; the expected value is 1
     angle_jump: Pair  # angle in the newest frame minus the predicted angle, during a grip [rad]
     d_jump: Pair  # d in the newest frame minus the predicted d [m]; 0 if d is not measured
     rejects_frames: Pair  # 1 if too many consecutive frames were rejected
     d_bias: Pair  # [m]
-    d_bias_std: Pair
     angle_bias: Pair  # [rad]
-    angle_bias_std: Pair
     has_bias: Pair  # 1 if the sensor's bias is significant
     gain_change: Pair  # ln(sensor gain / prior gain)
     gain_std: Pair

@@ -3,7 +3,8 @@
 Channel   Measures                                                         Noise
 torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05 N·m and torque
           while the joints close                                           held by the gears
-balance   ln N1 − ln N2 = 0, where N are the normal forces                 5 % and 0.4 N
+balance   ln of the forces on the object to the right and to the left,      5 % and 0.4 N
+          N1 and N2 plus PUSH, whose ratio is 1
 
 The force on a tip is ρ e^MODULUS F(D, θ). F is the tip's contact table, and ρ is the tip's
 relaxation factor.
@@ -18,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.perception.frame_channels import IMAGE_SHIFT_MIN
-from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.grasp import BALANCE, TORQUES
 from softfinger.daemon.perception.hand_state import (
     ANGLE,
     ANGLE_BIAS,
-    BALANCE,
     D_BIAS,
     FRICTION,
     GAIN,
@@ -32,10 +32,10 @@ from softfinger.daemon.perception.hand_state import (
     MODEL_ERROR_TIME,
     MODULUS,
     OUTLIER_GATE,
+    PUSH,
     TAPER,
     TORQUE,
     TORQUE_NOISE,
-    TORQUES,
     D,
     HandFilter,
     TrackedTip,
@@ -46,7 +46,7 @@ from softfinger.daemon.perception.hand_state import (
     predicted_variance,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Pair, Records
+from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import (
     FloatPair,
@@ -136,13 +136,17 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     normal = h.grasp.normal
     normal_min = min(normal[0], normal[1])
     if normal_min > 0.0 and h.t > h.balance_time:
+        push = h.mean[PUSH]
+        rightward = normal[0] + max(push, 0.0)
+        leftward = normal[1] + max(-push, 0.0)
+        h.slopes[MODULUS] = normal[0] / rightward
+        h.slopes[MODULUS + 1] = -normal[1] / leftward
         for k in range(2):
-            sense = 1.0 - 2.0 * k
-            h.slopes[MODULUS + k] = sense
-            h.slopes[D + k] = sense * _log_slope(h, k)
+            h.slopes[D + k] = h.slopes[MODULUS + k] * _log_slope(h, k)
+        h.slopes[PUSH] = 1.0 / rightward if push > 0.0 else 1.0 / leftward
         error = MODEL_ERROR + _SUPPORT_FRICTION / normal_min
         variance = error * error * max(MODEL_ERROR_TIME / (h.t - h.balance_time), 1.0)
-        correct(h, BALANCE, math.log(normal[1] / normal[0]), variance, GATE)
+        correct(h, BALANCE, math.log(leftward / rightward), variance, GATE)
     h.balance_time = h.t
 
 
@@ -290,36 +294,35 @@ def _write_consistency(h: HandFilter) -> None:
     grasp.sensor_fault = False
     for k in range(2):
         grasp.d_bias[k] = h.mean[D_BIAS + k]
-        grasp.d_bias_std[k] = math.sqrt(max(h.covariance[D_BIAS + k, D_BIAS + k], 0.0))
         grasp.angle_bias[k] = h.mean[ANGLE_BIAS + k]
-        variance = h.covariance[ANGLE_BIAS + k, ANGLE_BIAS + k]
-        grasp.angle_bias_std[k] = math.sqrt(max(variance, 0.0))
         grasp.gain_change[k] = h.mean[GAIN + k] - h.prior_mean[GAIN + k]
         grasp.gain_std[k] = math.sqrt(max(h.covariance[GAIN + k, GAIN + k], 0.0))
-    for k in range(2):
-        has_bias = _has_bias(grasp, k)
+        has_bias = _has_bias(h, k)
         grasp.has_bias[k] = 1.0 if has_bias else 0.0
         if has_bias or grasp.rejects_frames[k] or grasp.has_wrong_current[k]:
             grasp.sensor_fault = True
 
 
 @inner_kernel
-def _has_bias(grasp: GraspState, finger: int) -> bool:
+def _has_bias(h: HandFilter, finger: int) -> bool:
     """Return True if a sensor's zero offset or image has shifted significantly."""
-    if not (grasp.d_bias_std[finger] > 0.0 and grasp.d[finger] > 0.0):
+    d = h.grasp.d[finger]
+    d_variance = h.covariance[D_BIAS + finger, D_BIAS + finger]
+    angle_variance = h.covariance[ANGLE_BIAS + finger, ANGLE_BIAS + finger]
+    if not (d_variance > 0.0 and d > 0.0):
         return False
-    d_min = max(_D_BIAS_MIN * grasp.d[finger], OUTLIER_GATE * grasp.d_bias_std[finger])
-    angle_min = max(IMAGE_SHIFT_MIN, OUTLIER_GATE * grasp.angle_bias_std[finger])
-    in_d = _is_larger_bias(grasp.d_bias, finger, d_min)
-    return in_d or _is_larger_bias(grasp.angle_bias, finger, angle_min)
+    d_min = max(_D_BIAS_MIN * d, OUTLIER_GATE * math.sqrt(d_variance))
+    angle_min = max(IMAGE_SHIFT_MIN, OUTLIER_GATE * math.sqrt(max(angle_variance, 0.0)))
+    in_d = _is_larger_bias(h, D_BIAS, finger, d_min)
+    return in_d or _is_larger_bias(h, ANGLE_BIAS, finger, angle_min)
 
 
 @inner_kernel
-def _is_larger_bias(bias: Pair, finger: int, smallest: float) -> bool:
+def _is_larger_bias(h: HandFilter, pair: int, finger: int, smallest: float) -> bool:
     """Return True if a sensor's bias exceeds both ``smallest`` and the other sensor's bias.
 
     A bias in one sensor also causes a smaller apparent bias in the other sensor.
     """
-    size = abs(bias[finger])
-    is_larger: bool = size > smallest and size >= abs(bias[1 - finger])
+    size = abs(h.mean[pair + finger])
+    is_larger: bool = size > smallest and size >= abs(h.mean[pair + 1 - finger])
     return is_larger

@@ -28,13 +28,20 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softfinger.daemon.perception import frame_channels, grasp_kernels
 from softfinger.daemon.perception import hand_state as states
+from softfinger.daemon.perception.finger_model import make_prior
 from softfinger.daemon.perception.frame_channels import FrameContact
+from softfinger.daemon.perception.grasp import (
+    AMPLITUDE,
+    ANGLE_CHANNEL,
+    BALANCE,
+    FOOTPRINT,
+    TORQUES,
+)
 from softfinger.daemon.perception.hand_state import HISTORY_TIME, LAW_POINTS, HandFilter, HistoryRow
-from softfinger.daemon.perception.prior import UNKNOWN, Prior
+from softfinger.daemon.perception.prior import Prior
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import FINGERS, Contact, Frame, Goal, ObjectPose, Reading
@@ -44,8 +51,6 @@ from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.kinematics.hand.grasp_state import total_tilt
-
-FloatArray = NDArray[np.float64]
 
 # Standard deviations of two settings
 _TAPER_ERROR = 0.1  # `object.taper` [rad]
@@ -61,12 +66,12 @@ class HandEstimator:
         settings: Settings,
         tables: tuple[ContactTable, ContactTable],
         materials: tuple[Material, Material] | None = None,
-        priors: tuple[Prior, Prior] = (UNKNOWN, UNKNOWN),
+        priors: tuple[Prior, Prior] | None = None,
     ) -> None:
         """Create the estimator.
 
         Each tip has a contact table, priors and a material. The material specifies the error of the
-        stress-strain law.
+        stress-strain law. By default, the priors come from the settings.
         """
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
@@ -81,9 +86,8 @@ class HandEstimator:
         state.velocity_unit = VELOCITY_UNIT / gear
         state.latency = settings.tactile.latency
         state.frame_rate = settings.tactile.rate
-        state.frame_age_max = settings.safety.frame_age_fault * (1.0 / settings.tactile.rate)
+        state.frame_age_max = settings.safety.frame_age_fault / settings.tactile.rate
         state.rejected_max = settings.safety.frame_age_hold
-        self._age_max = state.frame_age_max
         state.response = settings.tactile.response
         state.relaxation[:] = settings.tip.relaxation
         state.relaxation_time[:] = settings.tip.relaxation_times
@@ -99,6 +103,8 @@ class HandEstimator:
             law = 0.0 if materials is None else materials[finger].force_error(ratios)
             state.tip[finger].law_error[:] = np.hypot(law, table.max_error)
             state.tip[finger].relaxation = 1.0 + sum(settings.tip.relaxation)
+        if priors is None:
+            priors = make_prior(settings, None), make_prior(settings, None)
         self._priors = priors
         self._history: Any = np.zeros(
             round(HISTORY_TIME * settings.loop.rate) + 2, dtype=HistoryRow.dtype
@@ -110,9 +116,7 @@ class HandEstimator:
         self.grasp.tilt_moment_ratio = 0.5 * sum(
             _tilt_moment_ratio(table, state.radius) for table in tables
         )
-        self._joints_read = False
         self._factors_outdated = True  # True if the factors have changed since they were written
-        self._in_contact = [False, False]
         self._invalid = [Invalid.NO_FRAME] * 2  # reason for rejecting each finger's newest estimate
 
     def _set_prior(self, settings: Settings, priors: tuple[Prior, Prior]) -> None:
@@ -144,7 +148,6 @@ class HandEstimator:
         If a grip sets the servo currents, ``goal`` is the goal at the time of the reading.
         Otherwise, ``goal`` is None.
         """
-        self._joints_read = True
         q1, q2 = reading.q
         dq1, dq2 = reading.dq
         current1, current2 = reading.current
@@ -180,8 +183,9 @@ class HandEstimator:
         if self._invalid[finger]:
             return  # The contact is still predicted from joint motion, but `t_valid` is not set.
         # Before the first joint reading, use the frame alone.
-        in_contact = estimate.contact and self._joints_read
-        if in_contact and self._in_contact[finger] and not has_changed:
+        tip = self._state.tip[finger]
+        in_contact = estimate.contact and self._state.t > -math.inf
+        if in_contact and tip.in_contact and not has_changed:
             contact.t_valid = frame.t_arrival
             return
         if in_contact and not frame_channels.update(
@@ -198,31 +202,23 @@ class HandEstimator:
         ):
             self._invalid[finger] = Invalid.CONTRADICTS_JOINTS
             return
-        self._in_contact[finger] = in_contact
         self._factors_outdated = True
         contact.t_valid = frame.t_arrival
         contact.contact, contact.gain = estimate.contact, estimate.gain
         contact.tilt_y, contact.misfit = estimate.tilt_y, estimate.misfit
         contact.shear_x, contact.shear_y = estimate.shear_x, estimate.shear_y
         if not in_contact:
-            tip = self._state.tip[finger]
             if tip.in_contact:
                 self.grasp.free_torque[finger] = 0.0  # measured again during the next approach
                 tip.free_torque_max[:] = 0.0
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0
-            _fill_from_frame(
-                contact,
-                estimate,
-                self._tables[finger],
-                tip.law_error,
-                self._priors[finger],
-                self._state.radius,
-            )
+            self._fill_from_frame(finger, contact, estimate)
 
     def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
         """Write the estimates at time ``t`` to ``contacts`` and ``pose``."""
-        in_contact = self._in_contact
+        tip = self._state.tip
+        in_contact = tip[0].in_contact, tip[1].in_contact
         pose.valid = in_contact[0] and in_contact[1] and self._estimates_object
         pose.angle = pose.width = 0.0
         if in_contact[0] or in_contact[1]:
@@ -234,9 +230,9 @@ class HandEstimator:
             self._factors_outdated = False
             for finger in self._fingers:
                 self._write_factors(contacts[finger], finger)
-            pose.nis_torque = self.grasp.nis.item(states.TORQUES)
-            pose.nis_balance = self.grasp.nis.item(states.BALANCE)
-        oldest = t - self._age_max
+            pose.nis_torque = self.grasp.nis.item(TORQUES)
+            pose.nis_balance = self.grasp.nis.item(BALANCE)
+        oldest = t - self._state.frame_age_max
         for finger in self._fingers:
             contact = contacts[finger]
             if in_contact[finger]:
@@ -266,9 +262,41 @@ class HandEstimator:
         contact.torque_scale = 1.0 + state.mean.item(at)
         contact.torque_scale_std = math.sqrt(max(state.covariance.item(at, at), 0.0))
         nis = grasp.nis
-        contact.nis_angle = nis.item(states.ANGLE_CHANNEL + finger)
-        contact.nis_footprint = nis.item(states.FOOTPRINT + finger)
-        contact.nis_amplitude = nis.item(states.AMPLITUDE + finger)
+        contact.nis_angle = nis.item(ANGLE_CHANNEL + finger)
+        contact.nis_footprint = nis.item(FOOTPRINT + finger)
+        contact.nis_amplitude = nis.item(AMPLITUDE + finger)
+
+    def _fill_from_frame(self, finger: int, contact: Contact, estimate: ContactEstimate) -> None:
+        """Fill ``contact`` with the estimate from a single frame.
+
+        The amplitude of a frame depends on both the tip modulus and the sensor gain. A deviation in
+        amplitude is attributed to modulus and gain in proportion to their prior variances.
+        """
+        table, prior = self._tables[finger], self._priors[finger]
+        contact.d, contact.theta = estimate.d, estimate.tilt_x
+        contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
+        contact.force = contact.energy = contact.force_std = 0.0
+        contact.inside = True
+        if not estimate.contact:
+            # Noise may hide a light contact.
+            contact.force_std = lookup(table, contact.d_std, 0.0)[0]
+            return
+        tilt = total_tilt(contact.theta, contact.tilt_y)
+        force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
+        stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
+        expected = prior.modulus[0] * prior.gain[0]
+        modulus = prior.modulus[0] * (contact.gain / expected) ** (stiff / (stiff + gain))
+        contact.force, contact.energy = modulus * force, modulus * energy
+        along = contact.theta / tilt if tilt > 0.0 else 0.0
+        across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
+        slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
+        fraction = contact.d / self._state.radius
+        law_error = np.interp(
+            fraction, np.linspace(0.0, 1.0, LAW_POINTS), self._state.tip[finger].law_error
+        )
+        relative = law_error**2 + stiff * gain / (stiff + gain)
+        variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
+        contact.force_std = math.sqrt(variance)
 
 
 def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
@@ -276,42 +304,6 @@ def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
     d, theta = 0.15 * radius, 0.05
     contact = table(d, theta)
     return float(contact.energy_theta / (contact.force * d)) / theta
-
-
-def _fill_from_frame(
-    contact: Contact,
-    estimate: ContactEstimate,
-    table: FloatArray,
-    law: FloatArray,
-    prior: Prior,
-    radius: float,
-) -> None:
-    """Fill ``contact`` with the estimate from a single frame.
-
-    ``table`` is the tip's contact table, and ``law`` is the relative error of its forces. The
-    amplitude of a frame depends on both the tip modulus and the sensor gain. A deviation in
-    amplitude is attributed to modulus and gain in proportion to their prior variances.
-    """
-    contact.d, contact.theta = estimate.d, estimate.tilt_x
-    contact.d_std, contact.theta_std = estimate.d_std, estimate.tilt_x_std
-    contact.force = contact.energy = contact.force_std = 0.0
-    contact.inside = True
-    if not estimate.contact:
-        contact.force_std = lookup(table, contact.d_std, 0.0)[0]  # Noise may hide a light contact.
-        return
-    tilt = total_tilt(contact.theta, contact.tilt_y)
-    force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
-    stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
-    expected = prior.modulus[0] * prior.gain[0]
-    modulus = prior.modulus[0] * (contact.gain / expected) ** (stiff / (stiff + gain))
-    contact.force, contact.energy = modulus * force, modulus * energy
-    along = contact.theta / tilt if tilt > 0.0 else 0.0
-    across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
-    slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
-    law_error = np.interp(contact.d / radius, np.linspace(0.0, 1.0, LAW_POINTS), law)
-    relative = law_error**2 + stiff * gain / (stiff + gain)
-    variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
-    contact.force_std = math.sqrt(variance)
 
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:

@@ -15,6 +15,8 @@ ANGLE, TAPER    rad    angle and taper of the object faces          rolling
 LATENCY         s      frame age beyond `tactile.latency`           (constant in a grip)
 FRICTION        N·m    mean joint torque not explained by the       slow drift
                        grip force
+PUSH            N      force on the object from left to right,      sudden sideways shift
+                       across its faces
 
 Each finger has its own states from D to TORQUE. Each name is the index for the left finger, and the
 next index is for the right finger. All quantities are in SI units.
@@ -28,7 +30,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.grasp import ENCODER_CHANNEL, GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
 from softfinger.kinematics.hand.grasp_state import FloatPair, Motion, held_motion
@@ -36,11 +38,7 @@ from softfinger.kinematics.hand.grasp_state import FloatPair, Motion, held_motio
 FloatArray = NDArray[np.float64]
 
 D, ENCODER, D_BIAS, ANGLE_BIAS, MODULUS, GAIN, TORQUE = range(0, 14, 2)
-ANGLE, TAPER, LATENCY, FRICTION, STATES = range(14, 19)
-
-# Index of each measurement channel in `grasp.CHANNELS`. For the first four channels, each name is
-# the index for the left tip. The next index is for the right tip.
-ANGLE_CHANNEL, FOOTPRINT, AMPLITUDE, ENCODER_CHANNEL, TORQUES, BALANCE = 0, 2, 4, 6, 8, 9
+ANGLE, TAPER, LATENCY, FRICTION, PUSH, STATES = range(14, 20)
 
 # Time span of the stored joint motion [s]. The assumed age of a frame is limited to HISTORY_TIME.
 HISTORY_TIME = 0.5
@@ -53,9 +51,9 @@ MODEL_ERROR_TIME = 0.1  # correlation time of the model error [s]
 TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time
 
 # Random walks during a grip (per √s)
-_WALK_CLOSING = 2e-5  # random walk of d1 + d2 [m]; small because the object has a constant width
-_WALK_SIDEWAYS = 3e-4  # random walk of d1 − d2 [m]; the object can move between the tips
-_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # random walk of d1 − d2 if frames measure only force × gain
+_WALK_CLOSING = 2e-5  # random walk of (d1 + d2)/2 [m]; small, as the object has a constant width
+_WALK_SIDEWAYS = 3e-4  # random walk of (d1 − d2)/2 [m]; the object can move between the tips
+_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # the same if frames measure only force × gain
 _WALK_LOOSE_D = 5e-3  # random walk of d for a contact without a grip [m]
 _WALK_LOOSE_ANGLE = 2e-2  # random walk of the angle for a contact without a grip [rad]
 _WALK_ANGLE = 2e-4  # random walk of the angle due to tip creep [rad]
@@ -78,7 +76,6 @@ class TrackedTip(Record):
     has_new_frame: bool  # True if a frame has arrived since the last update with joint torques
     gain_is_fixed: bool  # True if the frames measure force × gain instead of displacement
     rejected_count: int  # number of consecutive rejected frames
-    last_angle_jump: float  # `grasp.angle_jump` of the previous frame [rad]
     current_off_time: float  # time since the current began to differ from its goal [s]
     tilt_y: float  # [rad]
     shear: float  # shear force in the hand plane, measured by a solid tip [N]
@@ -246,6 +243,24 @@ def walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: flo
     h.covariance[state + 1, state + 1] += alike + other
     h.covariance[state, state + 1] += alike - other
     h.covariance[state + 1, state] += alike - other
+
+
+@inner_kernel
+def shift_sideways(h: HandFilter, variance: float) -> None:
+    """Add process noise for a sideways shift of the object between the tips.
+
+    ``variance`` is the variance of the shift [m²]. A shift x changes d1 by x and d2 by −x. Only a
+    push can shift an object that a grip holds. The push equals the change in F2 − F1, which is −x
+    times the sum of the tip stiffnesses.
+    """
+    h.scratch[:] = 0.0
+    h.scratch[D] = 1.0
+    h.scratch[D + 1] = -1.0
+    if is_held(h):
+        h.scratch[PUSH] = -(h.grasp.stiffness[0] + h.grasp.stiffness[1])
+    for i in (D, D + 1, PUSH):
+        for j in (D, D + 1, PUSH):
+            h.covariance[i, j] += variance * h.scratch[i] * h.scratch[j]
 
 
 @kernel
@@ -428,15 +443,14 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
     from the joint velocity.
     """
     tip = h.tip[finger]
-    at = ENCODER + finger
     found, spread = _encoder_measurement(h, finger, q, step)
     tip.encoder = q
     if spread == 0.0:
         return
-    h.slopes[at] = 1.0
+    h.slopes[ENCODER + finger] = 1.0
     correct(h, ENCODER_CHANNEL + finger, found - tip.q, spread * spread / 12.0, math.inf)
-    tip.q += h.mean[at]
-    h.mean[at] = 0.0
+    tip.q += h.mean[ENCODER + finger]
+    h.mean[ENCODER + finger] = 0.0
     if abs(q - tip.q) > 0.5 * h.encoder_resolution:
         tip.q = _edge(h, q, q - tip.q)
 

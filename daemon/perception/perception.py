@@ -148,7 +148,7 @@ class FingerPerception:
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration
         )
-        self._full_count = float(tactile.full_count)
+        self.full_count = float(tactile.full_count)
         self._scale = tactile.pascal_per_count  # pressure per unit of `_readings` [Pa]
         self._quantum = tactile.pascal_per_count  # pressure per sensor count [Pa]
         self._converter: Converter | None = None
@@ -171,11 +171,6 @@ class FingerPerception:
     def noise(self) -> float:
         """Measured standard deviation of the cell noise [Pa]; 0 if unknown."""
         return self._unloaded.scatter * self._quantum
-
-    @property
-    def full_count(self) -> float:
-        """Reading of a saturated cell [counts]."""
-        return self._full_count
 
     @property
     def is_taring(self) -> bool:
@@ -206,7 +201,7 @@ class FingerPerception:
             if self.frame_count % _ZERO_INTERVAL == 1:
                 self._unloaded.update(counts)
                 self._estimator.noise = max(self._noise, self._unloaded.noise * self._quantum)
-            counts = self._unloaded.corrected(counts, int(self._full_count))
+            counts = self._unloaded.corrected(counts, int(self.full_count))
         if self._converter is not None:
             readings: NDArray[Any] = self._converter(counts)
         elif self._zero is not None:
@@ -232,13 +227,9 @@ class FingerPerception:
         return np.rint(steps).astype(np.uint16)
 
     def _info(self, settings: Settings, model: FingerModel) -> SensorInfo:
-        scale = settings.tactile.pascal_per_count
-        if self._converter is not None:
-            scale = (
-                self._converter.largest / _PRESSURE_STEPS
-                if self._publishes_pressure
-                else self._converter.quantum
-            )
+        scale = self._quantum
+        if self._publishes_pressure and self._converter is not None:
+            scale = self._converter.largest / _PRESSURE_STEPS
         grid = model.grid
         return SensorInfo(
             *grid.pitches,
@@ -256,7 +247,7 @@ class FingerPerception:
         if self._tare_remaining_count:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
-        ends = self._full_count - np.round(mean)
+        ends = self.full_count - np.round(mean)
         if not np.median(ends) > 0.0:  # Most cells are saturated at their zero offset.
             text = f"the {side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))

@@ -15,9 +15,6 @@ class Prior(NamedTuple):
     servo is known to within 10 %.
     """
 
-    modulus: tuple[float, float] = (1.0, MODULUS_ERROR)
-    gain: tuple[float, float] = (1.0, 0.25)
-    torque: tuple[float, float] = (1.0, 0.1)
-
-
-UNKNOWN = Prior()
+    modulus: tuple[float, float]
+    gain: tuple[float, float]
+    torque: tuple[float, float]

@@ -304,14 +304,19 @@ def test_the_more_loaded_tip_is_not_pressed_beyond_the_force_limit():
     assert watched.run(50.0, 500) == FORCE, "the commanded force is never reduced"
 
 
-def test_a_push_across_the_faces_causes_no_fault():
+def test_a_lasting_push_across_the_faces_is_estimated_and_causes_no_fault():
+    """The estimates stay different, although both tips press equally without a push."""
     for push in (14.0, -14.0):
         with Hand({}) as hand:
             grasped(hand)
             hand.plant.apply_load(push, 0.0)
-            hand.watch(0.6)
-            assert hand.mode == "holding"
-            assert hand.plant.force.max() < 30.0
+            for _ in range(8):  # The grip force increases at first, and decreases after 1 to 3 s.
+                hand.watch(0.5)
+                assert hand.mode == "holding"
+                assert hand.plant.force.max() < 30.0
+                found = [contact.force for contact in hand.loop.state.contacts]
+                assert found == pytest.approx(hand.plant.force, rel=0.2)
+            assert not [kind for _, kind, _ in hand.events if kind.startswith("consistency.")]
 
 
 def test_a_grip_force_below_the_friction_limit_is_not_raised_by_torques():
