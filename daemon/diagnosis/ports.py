@@ -80,8 +80,7 @@ def check_port(path: str, key: str, mode_of_daemon: str = "") -> Finding:
         return _busy(path, mode_of_daemon)
     finally:
         os.close(descriptor)
-    others = users(path)
-    if others:
+    if users(path):
         return _busy(path, mode_of_daemon)
     return Finding("pass", path, "can be opened and is not in use")
 

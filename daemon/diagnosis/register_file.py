@@ -16,7 +16,7 @@ from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import CHECKED
+from softfinger.daemon.servos.checks import CHECKED, Registers
 from softfinger.daemon.servos.joint import servo_name
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
@@ -63,7 +63,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
             if table is None:
                 found.append(Finding("FAIL", servo_name(servo_id, finger), "not saved: no reply"))
                 continue
-            number = int.from_bytes(table[reg.MODEL_NUMBER : reg.MODEL_NUMBER + 2], "little")
+            number = Registers(table).word(reg.MODEL_NUMBER)
             values = {each.name: each.value_in(table) for each in REGISTERS}
             firmware = table[reg.FIRMWARE_VERSION]
             servos.append(

@@ -18,7 +18,7 @@ from typing import Any
 import zmq
 import zmq.utils.z85
 
-from softfinger.daemon.errors import AddressError, KeyFileError, NoDescriptor, SoftfingerError
+from softfinger.daemon.errors import AddressError, KeyFileError, NoDescriptor
 from softfinger.daemon.gateway import bounds
 from softfinger.daemon.wire.keys import load_server
 from softfinger.daemon.wire.local_stop import IN_USE, free_socket_path
@@ -26,10 +26,6 @@ from softfinger.daemon.wire.loop_link import repeated
 
 NO_WAIT = int(zmq.NOBLOCK)
 _LATEST_TOPIC = 0  # index of the topic that is also published in single-frame messages
-
-
-class RestartNeeded(SoftfingerError):
-    """All clients must disconnect and reconnect. The exception's message contains the reason."""
 
 
 class ClientSockets:
@@ -74,7 +70,7 @@ class ClientSockets:
         return opened
 
     def authenticate(self, now: float) -> None:
-        """Accept or reject new clients. Raises RestartNeeded if a key was removed."""
+        """Accept or reject new clients. Raises KeyFileError if a key was removed or is unusable."""
         self._update_keys(now)
         with contextlib.suppress(zmq.Again):
             for _ in range(bounds.HANDSHAKES_PER_TURN):
@@ -92,15 +88,12 @@ class ClientSockets:
         if self._keys is None or now < self._check_at:
             return
         self._check_at = now + bounds.KEY_CHECK_INTERVAL
-        try:
-            found = self._keys.left(self._folder)
-            with contextlib.suppress(NoDescriptor):  # All file descriptors are in use.
-                found = load_server(self._folder)
-        except KeyFileError as error:
-            raise RestartNeeded(str(error)) from None
+        found = self._keys.left(self._folder)
+        with contextlib.suppress(NoDescriptor):  # All file descriptors are in use.
+            found = load_server(self._folder)
         gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
         if gone or found.secret != self._keys.secret:
-            raise RestartNeeded(
+            raise KeyFileError(
                 f"access.keys: disconnected clients without a key file: {', '.join(gone) or 'all'}"
             )
         self._keys = found

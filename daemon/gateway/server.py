@@ -15,7 +15,6 @@ import resource
 import signal
 import socket
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,8 +32,6 @@ from softfinger.daemon.wire.loop_link import (
     Channel,
     machine_time,
 )
-
-_TIMER_INTERVAL = 0.5  # interval between resets of the timers that end a stalled process [s]
 
 
 class Server:
@@ -70,7 +67,7 @@ class Server:
     def step(self, seconds: float = bounds.STEP_WAIT_MAX) -> None:
         """Wait up to ``seconds`` for messages from the loop or clients, and handle them.
 
-        Raises RestartNeeded if a key was removed.
+        Raises KeyFileError if a key was removed or is unusable; all clients must then reconnect.
         """
         self._poller.poll(int(1e3 * seconds))
         now = self._clock()
@@ -102,15 +99,11 @@ def main(words: list[str]) -> int:
     try:
         with contextlib.closing(Server(channel, bounds.Config(*json.loads(words[1])))) as server:
             _tell_supervisor(bounds.READY)
-            timers_set = 0.0
             while not channel.over:
                 server.step()
-                now = time.monotonic()
-                if now - timers_set > _TIMER_INTERVAL:
-                    timers_set = now
-                    # SIGPROF and SIGALRM have no handlers, so these signals end the process.
-                    signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
-                    signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
+                # SIGPROF and SIGALRM have no handlers, so these signals end the process.
+                signal.setitimer(signal.ITIMER_PROF, bounds.STEP_CPU_TIME_MAX)
+                signal.setitimer(signal.ITIMER_REAL, bounds.STEP_TIME_MAX)
     except SoftfingerError as reason:
         _tell_supervisor(str(reason))
         return 1

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from softfinger.daemon.errors import AddressError
 from softfinger.daemon.gateway.bounds import READY, Config
-from softfinger.daemon.wire import loop_link
-from softfinger.daemon.wire.loop_link import Channel, Link
+from softfinger.daemon.wire.loop_link import Channel, Link, pair
 
 _ROOT = Path(__file__).parents[3]  # parent folder of the package
 _BIND_TIMEOUT = 60.0  # timeout for binding the sockets [s]
@@ -45,7 +44,7 @@ class Gateway:
         return self
 
     def _start(self) -> None:
-        ours, theirs = loop_link.pair()
+        ours, theirs = pair()
         paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
             # The -P option keeps Python from importing a folder named daemon in the working

@@ -32,7 +32,6 @@ from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
-from softfinger.kinematics.contact.table import ContactTable
 
 _RETRY_INTERVAL = 0.2  # time between connection attempts [s]
 
@@ -84,7 +83,6 @@ class Daemon:
             publisher, server = Publisher(wire), CommandServer(wire, clock=self.clock.now)
         elif wire:
             publisher, server = self._bind()
-        self.publisher = publisher
         scene = WantedScene(settings, on_event)
         self.models = scene.models
         warm_up(scene)
@@ -177,11 +175,6 @@ class Daemon:
             if sensor is not None:
                 made[finger] = sensor
         return made
-
-    @property
-    def tables(self) -> tuple[ContactTable, ContactTable]:
-        """Contact tables of both tips; tips of the same material share one table object."""
-        return self.models[0].table, self.models[1].table
 
     def close(self) -> None:
         """Turn torque off and close everything in reverse order. Never raises."""

@@ -246,17 +246,14 @@ class Loop:
         else:
             self._requests.watch_silence()
         state.mode = control.mode
-        breach = self._safety.judge(state)
-        if breach is not None or self._safety.warnings or self._after_opening is not None:
-            self._react(breach)
+        self._react(self._safety.judge(state))
         if self._heat.due and (action := self._heat.act(control, control.events)):
             self._requests.end_grip(action)
         if self._safety.must_hold and state.mode in GRIPPING_MODES:
             control.hold_goal(state.goal)
         else:
             control.step(self.period, state.goal)
-        if control.events or self.perception.events or self._reports:
-            self._emit_events()
+        self._emit_events()
         state.mode = control.mode
 
     def _emit_events(self) -> None:

@@ -89,7 +89,7 @@ class ProcessReplay:
             self._sensors[finger].frame = frame
         if self._servos is not None:
             self._servos.taken = taken
-        self._commands.waiting = list(commands)
+        self._commands.waiting = commands
         loop.state.seq = taken["seq"] - 1
         loop.state.timing.late_in_row = taken["late_in_row"]
         loop.state.timing.busy_s = taken["busy_s"]
@@ -174,7 +174,7 @@ class _Commands:
     """Command source that replays the recorded commands of a tick."""
 
     def __init__(self) -> None:
-        self.waiting: list[dict[str, Any]] = []
+        self.waiting: Sequence[dict[str, Any]] = ()
         self.link = Link()
 
     def serve(self, handler: Handler) -> None:
@@ -183,7 +183,3 @@ class _Commands:
                 handler(request, 0.0)
             except Refused:
                 pass  # After a refusal, the replayed states differ from the recording.
-        self.waiting = []
-
-    def close(self) -> None:
-        pass

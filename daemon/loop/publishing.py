@@ -59,7 +59,6 @@ class Publishing:
         self._scene = parts(settings)
         self.truth: Truth | None = None  # for simulated hands only
         self._numbers = [0, 0]  # number of published frames per finger
-        self._seen: list[Frame | None] = [None, None]  # newest frame per finger
         self._published = [-1, -1]  # `Frame.seq` // n of the last published frame, per finger
         self._states = self._maps = 0  # numbers of published messages
         # Time [s] and counts when the rates were last calculated.
@@ -71,8 +70,7 @@ class Publishing:
         wanted = publisher.wanted
         if wanted & _TACTILE:
             for perception in self._perceptions:
-                if perception.frame is not self._seen[perception.finger]:
-                    self._frame(state, perception)
+                self._frame(state, perception)
         if wanted & _INPUT:  # Publish inputs after the frames that they refer to.
             frames: list[Frame | None] = [None, None]
             for perception in self._perceptions:
@@ -92,8 +90,7 @@ class Publishing:
                 publisher.send(schema.STATS, *told, self._stats_every)
 
     def _frame(self, state: State, perception: FingerPerception) -> None:
-        frame = self._seen[perception.finger] = perception.frame
-        n = self._frames_every
+        frame, n = perception.frame, self._frames_every
         if frame is None or frame.seq // n == self._published[perception.finger]:
             return
         self._published[perception.finger] = frame.seq // n

@@ -45,6 +45,8 @@ GRANT_LATENCY = (
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
 # System call numbers of sched_setattr and sched_getattr for each machine type. The C library does
 # not wrap the two system calls. The argument of both calls is struct sched_attr: size, policy,
 # flags, nice, priority, runtime, deadline, period.
@@ -193,13 +195,12 @@ class RealTime:
         flags = _MCL_CURRENT | _MCL_ONFAULT
         if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
             flags |= _MCL_FUTURE
-        libc = ctypes.CDLL(None, use_errno=True)
-        if libc.mlockall(flags) != 0:
+        if _LIBC.mlockall(flags) != 0:
             why = os.strerror(ctypes.get_errno())
             text = f"memory lock denied ({why}): the loop's memory can be swapped out"
             self._refused(text, GRANT_MEMORY_LOCK)
         else:
-            self._granted("memory locked", libc.munlockall)
+            self._granted("memory locked", _LIBC.munlockall)
 
     def _hold_latency(self) -> None:
         """Prevent deep processor idle states while the device file is open."""
@@ -219,12 +220,11 @@ class RealTime:
 
     def _sharpen_timer(self, nanoseconds: int) -> None:
         """Reduce the timer slack, i.e. the time by which the kernel may delay wake-ups."""
-        libc = ctypes.CDLL(None, use_errno=True)
-        if libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
+        if _LIBC.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0) != 0:
             why = os.strerror(ctypes.get_errno())
             self._refused(f"timer slack denied ({why}): wake-ups may be 50 µs late")
         else:  # A value of 0 restores the initial slack.
-            undo = partial(libc.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
+            undo = partial(_LIBC.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
             self._granted(f"timer slack {nanoseconds} ns", undo)
 
 
@@ -236,14 +236,13 @@ def _threads() -> list[int]:
 def _set_slice(calls: tuple[int, int], thread: int, nanoseconds: int) -> bool:
     """Set a thread's time slice (0: system default); return True if the change took effect."""
     set_call, get_call = calls
-    libc = ctypes.CDLL(None, use_errno=True)
     size = _ATTRIBUTES.size
     nice = os.getpriority(os.PRIO_PROCESS, thread)
     asked = _ATTRIBUTES.pack(size, os.SCHED_OTHER, 0, nice, 0, nanoseconds, 0, 0)
-    if libc.syscall(set_call, thread, ctypes.create_string_buffer(asked), 0) != 0:
+    if _LIBC.syscall(set_call, thread, ctypes.create_string_buffer(asked), 0) != 0:
         return False
     found = ctypes.create_string_buffer(size)
-    if libc.syscall(get_call, thread, found, size, 0) != 0:
+    if _LIBC.syscall(get_call, thread, found, size, 0) != 0:
         return False
     return bool(_ATTRIBUTES.unpack(found.raw)[5] == nanoseconds)
 
@@ -265,7 +264,6 @@ class Service:
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._every = watchdog * _KEEP_ALIVE_FRACTION if watchdog > 0.0 else _NEVER
         self._due = -_NEVER
-        self._ready = False
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.setblocking(False)
 
@@ -284,9 +282,8 @@ class Service:
         """Send a keep-alive message if one is due at ``t`` [s]. The first message reports READY."""
         if t < self._due:
             return
+        message = b"READY=1\nWATCHDOG=1" if self._due == -_NEVER else b"WATCHDOG=1"
         self._due = t + self._every
-        message = b"WATCHDOG=1" if self._ready else b"READY=1\nWATCHDOG=1"
-        self._ready = True
         self._send(message)
 
     def stopping(self) -> None:

@@ -144,7 +144,7 @@ class Requests:
         torque: TorqueState,
         perception: Perception,
         emit: Callable[[str, str, str], None],
-        command_age_max: float = math.inf,
+        command_age_max: float,
     ) -> None:
         """Create the executor.
 
@@ -197,14 +197,14 @@ class Requests:
             control.stop()
             return {"mode": control.mode.value, "torque_off": self._torque.off()}
         command = name, numbers, _ = parse(request, control.mode)
+        grasps = name == "grasp" or (name == "hold" and control.mode not in GRIPPING_MODES)
         self._check_age(name, age)
         self._lease.check(command, state.t)
         if name == "clear":
             self._reconnect()
         if name in ("clear", "arm"):
             self._reopen(name)
-        self._check(name, numbers)
-        begins = control.mode not in GRIPPING_MODES
+        self._check(name, numbers, grasps)
         angle = self._handlers[name](**numbers)
         self._lease.renew(command, state.t)
         reply: dict[str, Any] = {"mode": control.mode.value}
@@ -212,7 +212,6 @@ class Requests:
             reply["angle"] = angle
         if "angle" in numbers and control.mode is Mode.GRASPING:
             reply |= {"queued": name, "until": Mode.HOLDING.value}
-        grasps = name == "grasp" or (name == "hold" and begins)
         if grasps and (warning := self._envelope.warning(numbers["force"])):
             reply["warning"] = warning
             self._emit("warning", "grasp", warning)
@@ -249,8 +248,6 @@ class Requests:
         After a stall, the client may no longer want the hand to move. The age limit is higher for
         setpoints during a grip and for harmless commands.
         """
-        if name == "status":
-            return
         streamed = name == "hold" and self._control.mode in GRIPPING_MODES
         longest = AGE_MAX if streamed or name in SAFE_COMMANDS else self._command_age_max
         if age > longest:
@@ -260,7 +257,7 @@ class Requests:
             )
             raise Refused(f"{text}; send it again", Reason.LATE)
 
-    def _check(self, name: str, numbers: dict[str, float]) -> None:
+    def _check(self, name: str, numbers: dict[str, float], grasps: bool) -> None:
         """Raise Refused if the state, the scene or a limit rules out an otherwise valid command."""
 
         def refuse_if(condition: object, reason: Reason, text: str) -> None:
@@ -275,8 +272,7 @@ class Requests:
                 "the servos have not yet confirmed that torque is off: check the power supply "
                 "and the cable",
             )
-        begins = name == "grasp" or (name == "hold" and self._control.mode not in GRIPPING_MODES)
-        if begins or name in ("arm", "clear"):
+        if grasps or name in ("arm", "clear"):
             cause = self._safety.cause(state, gripping=name != "arm")
             refuse_if(cause, Reason.STATE, cause)
         if name == "arm":
@@ -299,7 +295,7 @@ class Requests:
             refuse_if(
                 not numbers, Reason.REQUEST, "found neither force nor angle, expected at least one"
             )
-        if begins:
+        if grasps:
             taring = any(perception.is_taring for perception in fingers)
             refuse_if(taring, Reason.STATE, "a tare is in progress")
             text = "this command requires a tactile sensor on each finger of the scene"

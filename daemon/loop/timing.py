@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import TimeSpread, Timing
+from softfinger.daemon.types import Event, TimeSpread, Timing
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 
 TIMES = ("wake", "compute", "bus", "publish")
@@ -45,7 +45,6 @@ ATTRIBUTION_TIME = 0.25  # how long after a late tick a fault is attributed to t
 # Limits that a single late tick can violate.
 _TIME_LIMITS = frozenset({"servos.bus", "servos.silent", "tactile.silent", "loop.overruns"})
 
-Event = tuple[str, str, str]
 Counts = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 

@@ -101,18 +101,14 @@ class Publisher:
         """Bit mask of topics with subscribers; see `bit`."""
         return self._link.wanted
 
-    def look(self) -> None:
-        """Read the gateway's messages."""
-        self._link.look()
-
     def send(self, topic: bytes, *arguments: object) -> None:
         """Publish a message; ``arguments`` are passed to the topic's source in `wire.schema`."""
-        self._link.publish(_INDEX[topic], self._pack[topic](*arguments))
+        packed = self._pack[topic](*arguments)
+        self._link.publish(_INDEX[topic], packed, REPEATED_COUNTS.get(topic, 0))
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""
-        packed = self._pack[EVENT](self._count(EVENT), wall, t, level, kind, text)
-        self._link.publish(_INDEX[EVENT], packed, REPEATED_COUNTS[EVENT])
+        self.send(EVENT, self._count(EVENT), wall, t, level, kind, text)
 
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
@@ -123,8 +119,7 @@ class Publisher:
 
     def settings(self, wall: float, t: float, info: HandInfo) -> None:
         """Publish ``hand/settings``, once."""
-        packed = self._pack[SETTINGS](self._count(SETTINGS), wall, t, info)
-        self._link.publish(_INDEX[SETTINGS], packed, REPEATED_COUNTS[SETTINGS])
+        self.send(SETTINGS, self._count(SETTINGS), wall, t, info)
 
     def _count(self, topic: bytes) -> int:
         self._counts[topic] += 1

@@ -16,7 +16,7 @@ from softfinger import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import KeyFileError, NoDescriptor
 from softfinger.daemon.gateway.bounds import Config
-from softfinger.daemon.gateway.endpoints import ClientSockets, RestartNeeded
+from softfinger.daemon.gateway.endpoints import ClientSockets
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
 from tests.conftest import Addresses, until
 from tests.harness.gateway import Served
@@ -125,10 +125,10 @@ def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, mon
             load_server(folder)
         keys.authenticate(1.0)
         (clients / "alice.key").unlink()
-        with pytest.raises(RestartNeeded, match="disconnected clients without a key file: alice"):
+        with pytest.raises(KeyFileError, match="disconnected clients without a key file: alice"):
             keys.authenticate(2.0)
         clients.chmod(0o777)
-        with pytest.raises(RestartNeeded, match="other users can write to it"):
+        with pytest.raises(KeyFileError, match="other users can write to it"):
             keys.authenticate(3.0)
     finally:
         keys.close()

@@ -179,7 +179,7 @@ def _columns(
     """Return true and estimated values per frame; ``sign`` is the paper's sign of θ."""
     truth, estimates = (np.array(each) for each in zip(*rows, strict=True))
     d, theta = np.maximum(truth[:, 0], 0.0), truth[:, 1]
-    contact = daemon.tables[0](d, theta)
+    contact = daemon.models[0].table(d, theta)
     columns = {}
     for name, unit, factor, true, found in zip(
         ("d", "theta", "F", "U"), ("mm", "deg", "N", "mJ"), (1e3, math.degrees(sign), 1.0, 1e3),

@@ -123,7 +123,7 @@ def _serve(
         for event in measures.events():
             loop.emit(*event)
         seconds = time.monotonic() - _STARTED
-        within = max(table.max_error for table in daemon.tables)
+        within = max(model.table.max_error for model in daemon.models)
         ready = (
             f"ready after {seconds:.2f} s; state on {settings.stream.address}, commands on "
             f"{settings.commands.address}; next, in another terminal: softfinger send arm"
@@ -186,8 +186,8 @@ def _record(arguments: argparse.Namespace, settings: Settings, daemon: Any) -> A
     from softfinger.daemon.wire.publisher import bit
 
     def subscribed() -> bool:
-        daemon.publisher.look()
-        return bool(daemon.publisher.wanted & bit(schema.INPUT))
+        daemon.gateway.link.look()
+        return bool(daemon.gateway.link.wanted & bit(schema.INPUT))
 
     def ended(why: str) -> None:
         daemon.loop.report("error", "record", why)
