@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import checked
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Event
 
 __all__ = ["SimulatedDaemon"]
@@ -38,6 +39,10 @@ class TrueStates:
         return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
 
 
+def _in_virtual_time(sections: dict[str, dict[str, Any]]) -> Settings:
+    return checked(sections | {"loop": sections.get("loop", {}) | {"clock": "virtual"}})
+
+
 class SimulatedDaemon:
     """Daemon in virtual time with an observable simulated hand. Raises SettingsError."""
 
@@ -47,9 +52,9 @@ class SimulatedDaemon:
         hand: dict[str, dict[str, Any]] | None = None,
     ) -> None:
         """Build the daemon; the settings in ``hand`` default to the daemon's ``sections``."""
-        settings = checked(sections | {"loop": {"clock": "virtual"}})
+        settings = _in_virtual_time(sections)
         self.events: list[Event] = []
-        real = None if hand is None else checked(hand | {"loop": {"clock": "virtual"}})
+        real = None if hand is None else _in_virtual_time(hand)
         self._daemon = Daemon(settings, wire=False, on_event=self._note, hand=real)
         self.loop, self.state = self._daemon.loop, self._daemon.loop.state
         self.control = self.loop._control
@@ -59,8 +64,7 @@ class SimulatedDaemon:
         self.contacts = self.state.contacts
         self.settings = settings
 
-    def _note(self, *event: str) -> None:
-        level, kind, text = event
+    def _note(self, level: str, kind: str, text: str) -> None:
         self.events.append((level, kind, text))
 
     def __enter__(self) -> Self:

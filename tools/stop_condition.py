@@ -31,7 +31,8 @@ class StopCondition:
     signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self, duration: float | None = None, lifeline: int | None = None) -> None:
-        self._is_requested = False
+        # True if a signal has arrived or the pipe to the parent process has closed.
+        self.is_requested = False
         self._duration = math.inf if duration is None else duration
         self._deadline = math.inf
         self._lifeline = [] if lifeline is None else [lifeline]
@@ -39,11 +40,6 @@ class StopCondition:
     def begin(self) -> None:
         """Start the time limit."""
         self._deadline = time.monotonic() + self._duration
-
-    @property
-    def is_requested(self) -> bool:
-        """True if a signal has arrived or the pipe to the parent process has closed."""
-        return self._is_requested
 
     @property
     def is_met(self) -> bool:
@@ -63,14 +59,14 @@ class StopCondition:
         left = min(seconds, self._deadline - time.monotonic())
         watched = [self._wakes.fileno(), *self._lifeline, *others]
         readable = select.select(watched, [], [], max(0.0, left))[0]
-        if self._wakes.fileno() in readable and not self._is_requested:
+        if self._wakes.fileno() in readable and not self.is_requested:
             self._wakes.recv(4096)
-        self._is_requested |= bool(set(self._lifeline).intersection(readable))
+        self.is_requested |= bool(set(self._lifeline).intersection(readable))
         return [each for each in readable if each in others]
 
     def end(self, *_: object) -> None:
         """Ask the subcommand to end; this method may be called from a signal handler."""
-        self._is_requested = True
+        self.is_requested = True
         self.wake()
 
     def wake(self, *_: object) -> None:

@@ -135,7 +135,6 @@ class Sweep(Generic[Case, Result]):
                 while yielded in self._results:
                     yield self._results[yielded]
                     yielded += 1
-            yield from (self._results[k] for k in range(yielded, len(self._cases)))
 
     def _done(self, processes: int, scheduler: str | None) -> Iterator[int]:
         """Run the remaining cases and yield the number of completed cases."""

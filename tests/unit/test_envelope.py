@@ -78,3 +78,8 @@ def test_a_map_is_computed_printed_drawn_and_read(tmp_path, capsys):
         Envelope(settings(envelope=own, law="upright"))
     with pytest.raises(SettingsError, match=r"control.envelope: .*none.toml: can't be read"):
         Envelope(settings(envelope=str(tmp_path / "none.toml")))
+
+
+def test_hands_of_a_map_run_at_the_rate_of_the_profile():
+    with SimulatedDaemon({"loop": {"rate": 200.0}}) as hand:
+        assert hand.loop.period == pytest.approx(5e-3)

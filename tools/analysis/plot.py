@@ -157,8 +157,7 @@ def load_run(
 ) -> RecordedRun:
     """Read the data between ``start`` and ``end`` [s]. Raises RecordingError."""
     messages = recording.messages([schema.STATE], start, end, progress)
-    record = schema.TOPICS[schema.STATE].record
-    states = to_columns([read(record, message) for _, message in messages])
+    states = to_columns(read(schema.HandState, message) for _, message in messages)
     return RecordedRun(recording.path.name, *_model(recording), states, recording.zero)
 
 

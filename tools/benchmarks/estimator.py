@@ -78,9 +78,9 @@ _CORNER: Truth = (0.008, *tilts(math.radians(30.0), 0.7))
 _LIGHT: Truth = (0.001, 0.0, 0.0)
 
 
-def measure(brief: bool = False, rounds: int = 25) -> list[Report]:
+def measure(brief: bool = False) -> list[Report]:
     """Return run times and errors of lookups and frame estimates."""
-    rounds = 10 if brief else rounds
+    rounds = 10 if brief else 25
     return [lookups(rounds), frames_to_contacts(rounds)]
 
 

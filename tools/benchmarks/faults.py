@@ -24,11 +24,10 @@ from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.measuring import Report, Row
 from softfinger.tools.benchmarks.rigs import SOLID, Sections
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
+from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, diagnoses
 
 _TRIAL_COUNT = 20
 _FORCES = (6.0, 12.0)  # requested forces [N]
-_EVENT_PREFIX = "consistency."  # prefix of the event kinds that report a faulty measurement
 
 # Pass criteria. Forces are relative to the requested force, and times are in seconds.
 SETTLES = "settles at 0.8 to 1.2 without a force increase"
@@ -47,7 +46,7 @@ _REPEATED_LAG = 1.0  # time from the fault to the second force request [s]
 _SENSORS = ("left_sensor", "right_sensor")
 # The full scale is 127.5 kPa on real tactile boards, and 262 kPa by default in the simulated
 # sensor.
-_EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
+EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def _cases(force: float) -> Iterator[FaultCase]:
         for drift in (0.2, -0.2):
             words = f"{side}drift={drift}@0..2"
             name = f"{who}, zero {drift:+.0%} of full scale in 2 s"
-            yield lies(name, words=words, comes=2.0, settings=_EIGHT_BITS)
+            yield lies(name, words=words, comes=2.0, settings=EIGHT_BITS)
         for kind, change in (
             ("shift-x=3", "shifted by 3 cells"),
             ("shift-x=-3", "shifted by -3 cells"),
@@ -132,22 +131,12 @@ class GripTrial:
     end: str = ""  # final fault or mode
     events: list[tuple[float, str]] = field(default_factory=list)
 
-    def see(self, watch: Watch, mode: str, fault: str, events: list[tuple[float, str]]) -> None:
-        """Store the results of ``watch`` and the hand's final state."""
-        self.settled = watch.settled() if mode in GRIPPING_MODES else math.nan
-        self.peak, self.above, self.slid = watch.peak, watch.above, watch.slid
-        self.end, self.events = fault or mode, events
-
     def named(self, rightly: bool) -> list[tuple[float, str]]:
         """Return (time, channel) of each correct diagnosis.
 
         If ``rightly`` is False, the wrong diagnoses are returned instead.
         """
-        names = [
-            (t, k.removeprefix(_EVENT_PREFIX))
-            for t, k in self.events
-            if k.startswith(_EVENT_PREFIX)
-        ]
+        names = diagnoses(self.events)
         return [(t, name) for t, name in names if (name in self.false) == rightly]
 
     def missed(self, case: FaultCase) -> list[str]:
@@ -225,8 +214,10 @@ def trial(case: FaultCase, seed: int) -> GripTrial:
             watch.asked = case.then
             grip.command("grasp", force=case.then)
         loop.advance(case.comes + _OBSERVATION_TIME)
-        events = [(t - begin, kind) for t, kind in grip.alarms if t >= begin]
-        found.see(watch, state.mode, state.fault_name, events)
+        found.settled = watch.settled() if state.mode in GRIPPING_MODES else math.nan
+        found.peak, found.above, found.slid = watch.peak, watch.above, watch.slid
+        found.end = state.fault_name or state.mode
+        found.events = [(t - begin, kind) for t, kind in grip.alarms if t >= begin]
     return found
 
 

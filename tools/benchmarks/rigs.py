@@ -66,8 +66,8 @@ def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
                 context.destroy()
 
 
-def hold(daemon: Daemon, force: float = 8.0) -> None:
-    """Grasp the simulated object.
+def hold(daemon: Daemon) -> None:
+    """Grasp the simulated object with 8 N.
 
     Raises RigError if the object is not held within 10 s, and Refused if a command is refused.
     """
@@ -75,7 +75,7 @@ def hold(daemon: Daemon, force: float = 8.0) -> None:
     loop.advance(0.2)
     loop.command({"command": "arm"})
     loop.advance(0.2)
-    loop.command({"command": "grasp", "force": force})
+    loop.command({"command": "grasp", "force": 8.0})
     for _ in range(10):
         loop.advance(1.0)
         if loop.state.mode == "holding":

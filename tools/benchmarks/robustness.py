@@ -17,12 +17,12 @@ from typing import Any
 
 from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.daemon.types import FINGERS
+from softfinger.tools.benchmarks.faults import EIGHT_BITS
 from softfinger.tools.benchmarks.measuring import Report
 from softfinger.tools.benchmarks.rigs import Sections, merged
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
+from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch, diagnoses
 
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
 # Time limit for reaching the mode `holding`, undisturbed holding time, and observation time [s].
@@ -32,14 +32,10 @@ _ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
 _REPORT_TIME_MAX = 2.0  # time limit for reporting a force error above `_ERROR_MAX` [s]
 # Limits before a load is applied: ratio of force to requested force, and time above it [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
-_EVENT_PREFIX = "consistency."
 # Logarithm of the gain error above which the daemon may report a faulty sensor.
 _GAIN_ERROR_MIN = math.log(1.3)
 _LOAD_FRACTION = 0.8  # loads below this fraction of the friction limit must be held
 
-# The full scale is 127.5 kPa on real tactile boards, and 262 kPa by default in the simulated
-# sensor.
-_EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 _LATENCY = Settings().tactile.latency
 
 
@@ -79,7 +75,7 @@ ROWS = (
             words=f"drift={drift}@0..{s}",
             false=_BOTH_SENSORS,
         )
-        for of, board in (("", {}), (", 8 bits", _EIGHT_BITS))
+        for of, board in (("", {}), (", 8 bits", EIGHT_BITS))
         for drift, s in ((-0.05, 20), (-0.02, 20), (0.05, 20), (-0.05, 120))
     ),
     *(
@@ -234,9 +230,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
             loop.advance(2.0)
             found.lost = not hand.between()
         found.end = state.fault_name or str(state.mode)
-        names = [
-            (t - begin, k.removeprefix(_EVENT_PREFIX)) for t, k in hand.alarms if _EVENT_PREFIX in k
-        ]
+        names = [(t - begin, name) for t, name in diagnoses(hand.alarms)]
     found.accused = tuple(dict.fromkeys(name for _, name in names if name not in case.false))
     found.first_off -= begin
     # A diagnosis of any channel counts as a report of the force error.

@@ -9,7 +9,7 @@ import contextlib
 import gc
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from statistics import fmean
 from typing import Any, Self
 
@@ -25,6 +25,12 @@ _TORQUE_ERROR = 0.1  # maximum relative error of the torque constant
 _INCREASED_RATIO = 1.25
 _AVERAGING_TIME = 0.5  # time at the end of the hold over which the force is averaged [s]
 _SLIP_FRACTION = 0.999  # fraction of the friction limit above which a tip counts as slipping
+_EVENT_PREFIX = "consistency."  # prefix of the event kinds that report a faulty measurement
+
+
+def diagnoses(alarms: Iterable[tuple[float, str]]) -> list[tuple[float, str]]:
+    """Return the time and the channel of each alarm that reports a faulty measurement."""
+    return [(t, k.removeprefix(_EVENT_PREFIX)) for t, k in alarms if k.startswith(_EVENT_PREFIX)]
 
 
 class Watch:
@@ -91,9 +97,8 @@ class VirtualGrip(SimulatedDaemon):
         error = chance.uniform(-_TORQUE_ERROR, _TORQUE_ERROR)
         return cls(merged(sections, {"simulation": drawn}), torque=1.0 + error)
 
-    def _note(self, *event: str) -> None:
-        super()._note(*event)
-        level, kind, _ = event
+    def _note(self, level: str, kind: str, text: str) -> None:
+        super()._note(level, kind, text)
         if level != "info":
             self.alarms.append((self.now, kind))
 

@@ -156,7 +156,7 @@ def _while_pressed(
 
 def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | str]) -> None:
     """Print an instruction, then wait for Enter or run ``--move``. Raises CalibrationError."""
-    _say(told if arguments.move else f"{told}; then press Enter")
+    print(told if arguments.move else f"{told}; then press Enter", file=sys.stderr, flush=True)
     if arguments.move:
         _move(arguments.move, load)
     elif not sys.stdin.readline():
@@ -210,7 +210,3 @@ def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[F
                 yield frame
         elif clock.now() - waited > _PATIENCE:
             raise TactileError(f"no new frame from the sensor within {_PATIENCE:g} s")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

@@ -126,12 +126,7 @@ class Step:
     @cached_property
     def pressures(self) -> FloatArray:
         """Mean pressure [Pa] at each load, float64 [loads, rows, cols]."""
-        return np.stack(
-            [
-                np.mean([self.converter(frame) for frame in frames], axis=0)
-                for frames in self.loads.frames
-            ]
-        )
+        return np.stack([self.converter(frames).mean(axis=0) for frames in self.loads.frames])
 
     @property
     def cell_area(self) -> float:
@@ -314,7 +309,7 @@ def _law(step: Step) -> Done:
             ModulusStep, best, strain=strain, stress=stress, residual=best.force_error
         )
     try:
-        steps["law"], left = _measured(step, live)
+        steps["law"], left = _measured(step, signed)
         d_error, theta_error = left[:2]
         lines.append(_measured_told(steps["law"], left))
         if best.valid < 1.0 or (d_error < 0.5 * best.d_error and theta_error < best.theta_error):
@@ -345,8 +340,8 @@ def _law(step: Step) -> Done:
     return step.result(**steps, wants=wants), "\n  ".join(lines), ()
 
 
-def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArray]:
-    """Fit the tip's measured curves to the loads.
+def _measured(step: Step, pressures: FloatArray) -> tuple[TipCurves, FloatArray]:
+    """Fit the tip's measured curves to the loads with the mean ``pressures`` [n, rows, cols] [Pa].
 
     Returns
     -------
@@ -363,17 +358,16 @@ def _measured(step: Step, live: NDArray[np.bool_]) -> tuple[TipCurves, FloatArra
         raise CurvesError(
             "a cell saturated during a press, so the press can't be used; reduce the load"
         )
-    seen = [np.stack([converter(frame).copy() for frame in each]) for each in frames]
-    pressures = np.stack([converter.pressure(each) for each in step.over])
+    seen = [converter(each) for each in frames]
     rest = converter.pressure((tare.excess if tare else 0.0) * converter.gain)
     force, gain = pressures.sum(axis=(1, 2)) * step.cell_area, 1.0
     if (known := step.loads.truths.get("force")) is not None:
         gain = float(known @ force / (force @ force))
     radius = step.settings.tip.radius
-    presses = PressSums(d, theta, seen, pressures, rest, live, gain)
+    presses = PressSums(d, theta, seen, pressures, rest, converter.live, gain)
     law = fit_measured(presses, radius, step.plain_grid)
     placed = replace(step.plain_grid, centre=law.centre, rotation=law.rotation)
-    estimator = MeasuredEstimator(Fingertip(radius, "measured", law=law), placed, live)
+    estimator = MeasuredEstimator(Fingertip(radius, "measured", law=law), placed, converter.live)
     errors = []
     for k in np.flatnonzero(d > 0.0):
         found = [estimator(frame) for frame in seen[k]]

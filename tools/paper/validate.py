@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -96,15 +96,14 @@ _LAWS = {
 }
 
 
-def _table(law: str) -> Callable[..., FloatArray]:
-    table = ContactTable.build(_LAWS[law], Material.constant(MODULUS))
-    return lambda d, theta, name: np.asarray(getattr(table(d, theta), name))
+def _table(law: str) -> ContactTable:
+    return ContactTable.build(_LAWS[law], Material.constant(MODULUS))
 
 
 def _tips() -> Iterator[PublishedValue]:
     source = "Human Inspired Dexterity in Robotic Manipulation, table 7.1"
     for law in _LAWS:
-        zeta = exponent(DEPTHS, _table(law)(DEPTHS, 0.0 * DEPTHS, "force"))
+        zeta = exponent(DEPTHS, _table(law)(DEPTHS, 0.0).force)
         stiff = "with a constant modulus, ζ = 2 for every E" if law == "springs" else ""
         yield between(f"ζ of F = C d^ζ, 1 to 7 mm: {law}", 1.46, 1.88, f"silicone cores: {source}",
                       zeta, why=stiff)  # fmt: skip
@@ -123,7 +122,7 @@ def _tips() -> Iterator[PublishedValue]:
     springs = _table("springs")
     hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(RADIUS)
     d = np.linspace(0.004, 0.0079, 3901)
-    crossing = d[np.argmin(np.abs(springs(d, 0.0 * d, "force") - hertz * d**1.5))]
+    crossing = d[np.argmin(np.abs(springs(d, 0.0).force - hertz * d**1.5))]
     yield between("depth at which springs and Hertz (ν ½) have the same force", 6.4, 6.4,
                   "π E d² = 4/3 E* √a d^(3/2)", 1e3 * float(crossing), ".1f", " mm")  # fmt: skip
 
@@ -133,7 +132,7 @@ def _energy() -> Iterator[PublishedValue]:
 
     source = "Inoue & Hirai, the source of this model"
     for law in _LAWS:
-        energy = _table(law)(np.full(TILTS.shape, 0.004), TILTS, "energy")
+        energy = _table(law)(0.004, TILTS).energy
         minimum = math.degrees(TILTS[int(np.argmin(energy))])
         why = (
             ""
@@ -157,7 +156,7 @@ def _energy() -> Iterator[PublishedValue]:
     d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
     for face in ("frictionless", "sticking"):
         solid = ContactTable.build(replace(_LAWS["solid, bonded"], face=face), chosen)(d, 0.0).force
-        springs = _table("springs")(d, 0.0 * d, "force")
+        springs = _table("springs")(d, 0.0).force
         modulus = float(np.polyfit(solid, springs, 1)[0])
         over = modulus * solid - springs
         yield PublishedValue(

@@ -108,15 +108,11 @@ def build_kernels(
     names = ", ".join(part.name for part in missing)
     tell("info", "compile", f"compiling kernels (only on the first start): {names}")
     started = time.monotonic()
-    build = _Build(settings, missing, tell, Progress("compiling kernels", _kernels(missing), bar))
+    build = _Build(settings, missing, tell, bar)
     build.run()
     if not build.failed:
         tell("info", "compile", f"compiled in {time.monotonic() - started:.1f} s")
     return Built(len(missing), build.failed)
-
-
-def _kernels(missing: list[Part]) -> int:
-    return sum(part.kernels for part in missing)
 
 
 def _available() -> float:
@@ -131,13 +127,13 @@ def _available() -> float:
 class _Build:
     """Build pipeline parts in several processes, each controlled by its own thread."""
 
-    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: Progress) -> None:
+    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: bool) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
         self._at: dict[str, str] = {}  # for each part, the kernel that is being compiled
-        self._total, self._begun = _kernels(missing), 0
+        self._total, self._begun = sum(part.kernels for part in missing), 0
         self._started = time.monotonic()
-        self._bar, self._tell = bar, tell
+        self._bar, self._tell = Progress("compiling kernels", self._total, bar), tell
         self._processes: list[subprocess.Popen[str]] = []
         self._own = threading.local()  # Each thread uses its own process.
         self.failed = self._over = False

@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol
 
+from softfinger.daemon.client.stream import read, to_columns
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import SIZE_MAX, open_regular, unpacked_size_max
 from softfinger.daemon.wire import schema
@@ -61,13 +62,10 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     RecordingError
         If the file is not a recording or does not contain states.
     """
-    from softfinger.daemon.client.stream import read, to_columns
-    from softfinger.daemon.wire.schema import STATE, HandState
-
     recording = Recording(Path(path))
-    states = [read(HandState, message) for _, message in recording.messages({STATE})]
+    states = [read(schema.HandState, message) for _, message in recording.messages({schema.STATE})]
     if not states:
-        raise RecordingError(f"{path}: the recording does not contain {STATE.decode()}")
+        raise RecordingError(f"{path}: the recording does not contain {schema.STATE.decode()}")
     columns = to_columns(states)
     return {"t": (columns["mono_ns"] - recording.zero) * 1e-9, **columns}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.profile.settings import Settings
@@ -34,12 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _values(settings: Settings, row: Limit) -> list[str]:
     """Format a limit's settings, each with the fraction at which a violation is reported."""
     share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
-    return [f"{share}{key} = {_shown(_value(settings, key))}" for key in row.keys]
-
-
-def _value(settings: Settings, key: str) -> Any:
-    section, _, name = key.partition(".")
-    return getattr(getattr(settings, section), name)
+    return [f"{share}{key} = {_shown(attrgetter(key)(settings))}" for key in row.keys]
 
 
 def _shown(value: Any) -> str:

@@ -18,6 +18,7 @@ FloatArray = NDArray[np.float64]
 
 LEVELS = 32  # number of colours; redraws are faster with fewer colours
 SHADES = " ·░▒▓█"  # shades for terminals with too few colours
+_SHRINK_TIME = 3.0  # time for which a smaller scale must suffice before the scale shrinks [s]
 
 # Lightness increases in equal steps from dark blue to bright yellow. The order of the colours is
 # therefore also visible in greyscale and to colour-blind users.
@@ -127,22 +128,16 @@ def round_up(value: float) -> float:
 class FullScale:
     """Full-scale value that rises immediately with a signal's peak, and falls after a delay."""
 
-    def __init__(self, smallest: float, patience: float = 3.0) -> None:
+    def __init__(self, smallest: float) -> None:
         self._smallest = smallest
-        # Time [s] for which a smaller scale must be sufficient before the scale shrinks.
-        self._patience = patience
         self._since: float | None = None
         self.value = smallest
 
     def follow(self, peak: float, now: float) -> float:
         """Update the scale with the signal's ``peak`` at time ``now`` [s], and return the scale."""
         end = max(self._smallest, round_up(peak)) if peak > 0.0 else self._smallest
-        if end >= self.value:
-            self.value = end
-            self._since = None
+        if end >= self.value or (self._since is not None and now - self._since > _SHRINK_TIME):
+            self.value, self._since = end, None
         elif self._since is None:
             self._since = now
-        elif now - self._since > self._patience:
-            self.value = end
-            self._since = None
         return self.value

@@ -19,6 +19,7 @@ from typing import Any, Self
 
 import zmq
 
+from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.tools.arguments import (
     WAIT_MAX,
     add_stream,
@@ -39,7 +40,6 @@ _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
 _ACCUMULATION_TIME = 1.0  # time for which a new force replaces the force in the stream [s]
 _CONFIRMATION_TIME = 3.0  # time limit for the second press of d, which confirms disarming [s]
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
-_GRIPPING = ("grasping", "holding", "rotating")
 
 
 class HandKeys:
@@ -82,7 +82,7 @@ class HandKeys:
 
     @property
     def _gripping(self) -> bool:
-        return self._feed.mode in _GRIPPING
+        return self._feed.mode in GRIPPING_MODES
 
     def _adding(self, now: float) -> bool:
         """Return True while the stream may still contain the force from before a key press."""

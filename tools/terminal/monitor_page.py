@@ -94,7 +94,7 @@ class MonitorPage:
     guarded: bool = False  # True if the page uses access keys
     force: float = math.nan  # force requested when the grasp key is pressed [N]
     explains: bool = False  # True if the page shows explanations instead of numbers
-    _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3, 3.0))
+    _pressure: heatmap.FullScale = field(default_factory=lambda: heatmap.FullScale(5e3))
 
     def lines(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
         """Return the page as ``height`` lines of exactly ``width`` columns."""
