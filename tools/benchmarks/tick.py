@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -118,18 +118,18 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
     return samples
 
 
-def in_the_loop(title: str, turns: int, baud: int) -> Report:
+def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
     """While holding an object, time complete ticks and plain servo exchanges over ptys alternately.
 
-    A ``baud`` of 0 disables pacing. Raises RigError if the hand loses its grip, e.g. on a busy
-    machine.
+    A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
+    hand loses its grip, e.g. on a busy machine.
     """
     in_place: list[float] = []
     back_to_back: list[float] = []
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         stack.enter_context(emulator_process("--dir", folder, "--config", HIL, "--baud", baud))
-        daemon = stack.enter_context(Daemon(load(HIL, folder), wire=False))
+        daemon = stack.enter_context(Daemon(load(HIL, folder, changes), wire=False))
         stack.enter_context(RealTime(daemon.settings))
         loop, clock, state = daemon.loop, daemon.clock, daemon.loop.state
         hold(daemon)
