@@ -304,7 +304,7 @@ def test_the_more_loaded_tip_is_not_pressed_beyond_the_force_limit():
     assert watched.run(50.0, 500) == FORCE, "the commanded force is never reduced"
 
 
-def test_a_lasting_push_across_the_faces_is_estimated_and_causes_no_fault():
+def test_a_sudden_lasting_push_across_the_faces_is_estimated_and_causes_no_fault():
     """The estimates stay different, although both tips press equally without a push."""
     for push in (14.0, -14.0):
         with Hand({}) as hand:
