@@ -269,6 +269,7 @@ def test_counts_clipped_at_zero_cause_no_bias(free_gain):
     assert np.all(np.sqrt(np.mean(np.square(score), axis=0)) < 1.12)
 
 
+@pytest.mark.extended
 def test_a_light_touch_is_detected_and_noise_is_not():
     rng = np.random.default_rng(8)
     missed = 0

@@ -21,7 +21,7 @@ LONG = pytest.mark.extended
         ("joint friction 0.12 N·m", 1),
         ("joint friction 0.20 N·m", 1),
         pytest.param("stiction 0.15 N·m", 1, marks=LONG),
-        ("zero +5% in 20 s, 8 bits", 1),
+        pytest.param("zero +5% in 20 s, 8 bits", 1, marks=LONG),
         ("frames 15 ms older", 1),
         ("frames 10 ms older", 1),
         *(pytest.param(name, 1, marks=LONG) for name in ("frames 30 ms older", "cells of 80 ms")),
