@@ -59,6 +59,7 @@ def calibrate(hand: tuple[Path, Hand]) -> Calibrate:
     return run
 
 
+@pytest.mark.extended
 def test_friction_is_calibrated_by_sweeping_a_joint(hand, calibrate, capsys):
     profile, client = hand
     assert calibrate("friction", "--set", 'scene.fingers=["left"]') == 0

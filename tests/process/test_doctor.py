@@ -127,6 +127,7 @@ def test_registers_are_stored_before_a_change_and_restored(hands, capsys, tmp_pa
     assert f"{tmp_path}/none.json: No such file or directory" in lines[-1] + "".join(lines)
 
 
+@pytest.mark.extended
 def test_boards_are_checked(hands, capsys):
     hand = hands()
     status, lines = hand.doctor(capsys)
