@@ -39,11 +39,8 @@ ROOT = Path(__file__).parents[2]
 SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 PAGES = [page for page in SOURCES if re.search(r"(?m)^ *(```\w|<!--)", page.read_text("utf-8"))]
 USUAL = ("tcp://127.0.0.1:9872", "tcp://127.0.0.1:9873")
-LONG = (
-    "tutorial.md",
-    "recordings.md",
-    "test-your-controller.md",
-)  # pages with commands that take almost a minute
+# Pages with commands that take almost a minute.
+LONG = ("tutorial.md", "recordings.md", "test-your-controller.md")
 MARK = re.compile(r"^ *<!-- (?:not run|exits)\b.*-->$", re.M)
 REASON = re.compile(r"not run: \S.*|not run without \w+|exits 1: \S.*")
 FENCE = re.compile(
