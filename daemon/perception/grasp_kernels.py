@@ -3,8 +3,7 @@
 Channel   Measures                                                         Noise
 torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05 N·m and torque
           while the joints close                                           held by the gears
-balance   ln of the forces on the object to the right and to the left,      5 % and 0.4 N
-          N1 and N2 plus PUSH, whose ratio is 1
+balance   N1 + PUSH = N2 as a ratio, where N are the normal forces         5 % and 0.4 N
 
 The force on a tip is ρ e^MODULUS F(D, θ). F is the tip's contact table, and ρ is the tip's
 relaxation factor.
