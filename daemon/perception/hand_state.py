@@ -231,18 +231,18 @@ def _walk(h: HandFilter, state: int, per_root_second: float, dt: float) -> None:
 
 
 @inner_kernel
-def walk_pair(h: HandFilter, state: int, common: float, opposite: float, dt: float) -> None:
-    """Add process noise to a pair of states.
+def _walk_d(h: HandFilter, common: float, opposite: float, dt: float) -> None:
+    """Add process noise to both displacements.
 
-    The ``common`` noise changes both states by the same amount. The ``opposite`` noise changes the
-    two states by opposite amounts.
+    The ``common`` noise changes both displacements by the same amount. The ``opposite`` noise
+    changes the two displacements by opposite amounts.
     """
     alike = common * common * dt
     other = opposite * opposite * dt
-    h.covariance[state, state] += alike + other
-    h.covariance[state + 1, state + 1] += alike + other
-    h.covariance[state, state + 1] += alike - other
-    h.covariance[state + 1, state] += alike - other
+    h.covariance[D, D] += alike + other
+    h.covariance[D + 1, D + 1] += alike + other
+    h.covariance[D, D + 1] += alike - other
+    h.covariance[D + 1, D] += alike - other
 
 
 @inner_kernel
@@ -378,7 +378,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
         sideways_error = MODEL_ERROR * (arm1 * step1 - arm2 * step2)
         samples = MODEL_ERROR_TIME / dt
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
-        walk_pair(h, D, closing_error, sideways_error, samples)
+        _walk_d(h, closing_error, sideways_error, samples)
     _add_rounding_noise(h, 0, by1, turn1, dt)
     _add_rounding_noise(h, 1, by2, -turn2, dt)
 
@@ -421,13 +421,13 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
             sideways = 0.0
         elif h.tip[0].gain_is_fixed and h.tip[1].gain_is_fixed:
             sideways = _WALK_SIDEWAYS_FIXED_GAIN
-        walk_pair(h, D, _WALK_CLOSING, sideways, dt)
+        _walk_d(h, _WALK_CLOSING, sideways, dt)
         _walk(h, ANGLE, _WALK_ANGLE, dt)
         for k in range(2):
             _walk(h, D_BIAS + k, _WALK_D_BIAS, dt)
             _walk(h, ANGLE_BIAS + k, _WALK_ANGLE_BIAS, dt)
     else:
-        walk_pair(h, D, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
+        _walk_d(h, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
         _walk(h, ANGLE, _WALK_LOOSE_ANGLE, dt)
     _walk(h, FRICTION, TORQUE_NOISE, dt)
     for k in range(2):
