@@ -410,9 +410,9 @@ class Control:
         elif self.fingers.advance_setpoints(self._settings.control.approach_speed):
             state.arrived_for += dt
             if state.arrived_for > _STUCK_TIME:
-                self._warn(
-                    "grasp", "the fingers reached their joint limits without finding an object"
-                )
+                off = self.fingers.distance_max
+                where = "at" if off < _ARRIVAL_DISTANCE else f"{math.degrees(off):.1f}° before"
+                self._warn("grasp", f"the fingers found no object and stopped {where} their limits")
                 self.fingers.hold_here()
                 self._enter_armed()
 

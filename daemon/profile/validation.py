@@ -34,8 +34,8 @@ def plausibility_warnings(settings: Settings) -> list[str]:
 
     The warnings are reported by the commands ``run``, ``doctor`` and ``config check``.
     """
-    grip = [warning for check in (_deep_grip, _strong_grip) for warning in check(settings)]
-    return sensor_warnings(settings) + grip
+    checks = _deep_grip, _strong_grip, _weak_approach
+    return sensor_warnings(settings) + [text for check in checks for text in check(settings)]
 
 
 def sensor_warnings(settings: Settings) -> list[str]:
@@ -116,6 +116,18 @@ def _strong_grip(settings: Settings) -> Iterator[str]:
                 f"{key}: found {force:g} N, expected at most {bound:.3g} N, the force at "
                 f"safety.current_max = {settings.safety.current_max:g} A on this finger"
             )
+
+
+def _weak_approach(settings: Settings) -> Iterator[str]:
+    """Compare the joint torque during the approach with the joint friction."""
+    control = settings.control
+    torque = control.approach_current * control.torque_constant
+    if settings.servos.backend != "none" and torque <= control.joint_friction:
+        yield (
+            f"control.approach_current: found {control.approach_current:g} A ({torque:.3g} N·m), "
+            f"expected a torque above control.joint_friction = {control.joint_friction:g} N·m; "
+            "increase it, otherwise the fingers cannot close"
+        )
 
 
 def _set_forces(settings: Settings) -> list[tuple[str, float]]:

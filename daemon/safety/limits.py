@@ -424,7 +424,8 @@ def _joint_swapped(view: View, _: State, __: float) -> str:
 
 
 @Limit("joint.blocked", "joint that stops for 0.5 s at maximum current during the "
-    "approach although its tip has no contact", "warn", ("servos.direction",), "servos",
+    "approach although its tip has no contact", "warn",
+    ("control.approach_current", "servos.direction"), "servos",
     lasts=0.5).each  # fmt: skip
 def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
     goal, reading, contact = state.goal, state.reading, state.contacts[i]
@@ -438,8 +439,9 @@ def _joint_blocked(view: View, state: State, _: float, i: int) -> str:
         return ""
     return (
         f"the {FINGERS[i]} joint has stopped at {math.degrees(reading.q[i]):.0f}° during the "
-        "approach although its tip has no contact: remove the obstacle; if the finger opens "
-        "instead of closing, correct servos.direction"
+        "approach although its tip has no contact: remove the obstacle; if joint friction stops "
+        "the finger, run `softfinger calibrate friction` and increase control.approach_current; "
+        "if the finger opens instead of closing, correct servos.direction"
     )
 
 

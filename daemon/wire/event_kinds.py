@@ -231,7 +231,9 @@ KINDS: dict[str, EventKind] = {
     "joint.blocked": EventKind(
         "warning",
         "A joint has stopped at maximum current during the approach, but its tip has no contact.",
-        f"Remove the obstacle, or correct `servos.direction`. {_CALIBRATE_JOINTS}",
+        "Remove the obstacle. If joint friction stops the finger, run `softfinger calibrate "
+        "friction` and increase `control.approach_current`. If the finger opens instead of "
+        f"closing, correct `servos.direction`. {_CALIBRATE_JOINTS}",
     ),
     "joint.strained": EventKind(
         "warning",

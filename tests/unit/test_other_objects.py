@@ -105,6 +105,14 @@ def test_without_an_object_between_the_tips_the_hand_opens(force, frames):
         )
 
 
+def test_fingers_that_do_not_reach_an_object_stop_at_their_limits():
+    with Rig({"simulation": {"object_shape": "none"}, "hand": {"q_max": (0.3, 0.3)}}) as rig:
+        rig.grasp(6.0, 5.0)
+        assert rig.state.mode == "armed"
+        (text,) = [text for _, kind, text in rig.events if kind == "grasp"]
+        assert text == "the fingers found no object and stopped at their limits"
+
+
 def test_a_declared_sheet_is_not_mistaken_for_a_missing_object():
     sheet = {"simulation": {"object_width": 0.001}, "object": {"width_min": 0.0005}}
     with Rig(sheet) as rig:

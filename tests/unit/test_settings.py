@@ -368,6 +368,10 @@ def test_addresses_outside_this_machine_require_keys(tmp_path):
          "force of 27 N, but the stall torque of XL330-M288 limits the force of this finger "
          "to 6.5 N"),
         (["servos.model=XL330-M288", "servos.backend=none"], ""),
+        (["control.joint_friction=0.26"], ""),
+        (["control.joint_friction=0.27"], "control.approach_current: found 0.15 A (0.267 N·m), "
+         "expected a torque above control.joint_friction = 0.27 N·m; increase it"),
+        (["control.joint_friction=0.27", "servos.backend=none"], ""),
     ],
 )  # fmt: skip
 def test_forces_that_the_hand_does_not_have_are_warned_of(changes, told):

@@ -212,3 +212,14 @@ def test_fingers_that_stand_in_the_approach_are_reported(make):
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
     assert told.startswith("the left joint has stopped at 3")
     assert told.endswith("correct servos.direction")
+
+
+def test_joints_whose_friction_exceeds_the_approach_torque_are_reported(make):
+    daemon = make("right", joint_friction=0.2, joint_stribeck=0.1)
+    events = heard(daemon)
+    command(daemon, "grasp", force=6.0)
+    greatest_force(daemon, 8.0)
+    assert daemon.loop.state.mode == "armed"
+    assert "increase control.approach_current" in texts(events, "joint.blocked")[0]
+    (text,) = texts(events, "grasp")
+    assert text == "the fingers found no object and stopped 57.3° before their limits"
