@@ -23,7 +23,6 @@ from softfinger.kinematics.hand.upright import upright_spring
 FloatArray = NDArray[np.float64]
 
 _TORQUE_ERROR_SIGMA = 2.0  # force margin, in standard deviations of the torque constant
-_INTEGRAL_RATIO = 0.3  # limit of the integral term, as a fraction of the force target
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
 _DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation while the tip forces are equalised [rad]
 _STIFFNESS_MIN = 100.0  # lower limit of the stiffness, which is used as a divisor [N/m]
@@ -131,9 +130,9 @@ def grip_torques(
         setpoint.reset(g.force, force_windows, g.force.target)
     target = setpoint.advance(g.force, force_windows, g.force_rate)
     target = min(target, g.slip.balanced_max)
-    limit = _force_limit(g, grasp.load_arm * g.slip.load, mean(grasp.moment_arm))
-    bound = _INTEGRAL_RATIO * g.force.target
-    g.grip_force = _grip_force(g, target, mean(grasp.force), bound, limit)
+    load_torque = grasp.load_arm * g.slip.load
+    limit = _force_limit(g, mean(grasp.moment_arm), mean(grasp.free_torque), load_torque)
+    g.grip_force = _grip_force(g, target, mean(grasp.force), limit)
     g.offset_rate = 0.0
     if g.is_steering:
         g.offset_rate = _steer(g, angle_windows, grasp, angle)
@@ -185,9 +184,9 @@ def single_torque(
         # The supported object can't move, so friction at the tip may balance part of the torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
-        limit = _force_limit(g, g.slip.law.friction * g.force.target * max(reach, 0.0), arm)
-        bound = max(limit - g.force.target, 0.0)
-        g.grip_force = _grip_force(g, target, grasp.force[finger], bound, limit)
+        held_torque = g.slip.law.friction * g.force.target * max(reach, 0.0)
+        limit = _force_limit(g, arm, grasp.free_torque[finger], held_torque)
+        g.grip_force = _grip_force(g, target, grasp.force[finger], limit)
         closing_rate = g.force.speed / (stiffness * arm)
     damping = _damping(g.law, stiffness, arm) * (closing_rate - dq)
     motor_torque = _motor_torque(g.law, arm * g.grip_force, closing_rate)
@@ -215,33 +214,31 @@ def _damping(law: GripLaw, stiffness: float, arm: float) -> float:
 
 
 @inner_kernel
-def _grip_force(g: GripState, target: float, measured: float, bound: float, limit: float) -> float:
-    """Return the sum of ``target`` and the force feedback, but at most ``limit`` [N].
-
-    ``bound`` limits the integral term.
-    """
+def _grip_force(g: GripState, target: float, measured: float, limit: float) -> float:
+    """Return the sum of ``target`` and the force feedback, but at most ``limit`` [N]."""
     law = g.law
     error = target - measured
     # Anti-windup: do not increase the integral while a torque is at its limit.
     full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
     if not full or error < 0.0:
         integral = g.integral + law.force_bandwidth * error * law.dt
-        g.integral = clip(integral, bound)
+        g.integral = clip(integral, max(limit - g.force.target, 0.0))
     force: float = target + (law.force_gain * error + g.integral)
     return min(force, limit)
 
 
 @inner_kernel
-def _force_limit(g: GripState, load: float, arm: float) -> float:
+def _force_limit(g: GripState, arm: float, free_torque: float, load: float) -> float:
     """Return an upper limit for the grip force [N], independent of the tactile readings.
 
     The limit is the target force plus three margins. The margins cover the torque constant error,
     the joint friction and the torque ``load`` [N·m] that the detected load causes. ``arm`` is the
-    moment arm of the grip force [m].
+    moment arm of the grip force [m], and ``free_torque`` is the joint torque during the approach
+    [N·m].
     """
-    law = g.law
-    force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * law.torque_error)
-    return force + (law.friction + load) / max(arm, g.slip.law.arm_min)
+    force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * g.law.torque_error)
+    friction = slip_monitor.coulomb_friction(g.slip, free_torque)
+    return force + (friction + load) / max(arm, g.slip.law.arm_min)
 
 
 @inner_kernel

@@ -243,11 +243,21 @@ def _update_friction(s: SlipState, grasp: GraspState) -> float:
     Rolling uses a part of the tip friction that increases with the grip force.
     """
     law = s.law
-    free_torque = max(mean(grasp.free_torque), law.joint_friction)
-    s.friction = min(free_torque, law.friction_max) + law.load_friction * _moment(grasp)
+    s.friction = coulomb_friction(s, mean(grasp.free_torque))
+    s.friction += law.load_friction * _moment(grasp)
     spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
     s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
     return spare_friction
+
+
+@inner_kernel
+def coulomb_friction(s: SlipState, free_torque: float) -> float:
+    """Return the load-independent joint friction [N·m].
+
+    The setting is used unless the joint required a higher ``free_torque`` during the approach.
+    """
+    friction: float = min(max(free_torque, s.law.joint_friction), s.law.friction_max)
+    return friction
 
 
 @inner_kernel

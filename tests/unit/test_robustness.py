@@ -79,6 +79,19 @@ def test_joint_friction_is_estimated_during_the_approach(friction, stiction):
         assert (shown < friction + stiction + 0.025).all()
 
 
+@pytest.mark.parametrize(
+    ("friction", "torque", "force"), [(0.13, 0.87, 4.4), (0.12, 0.9, 6.0), (0.15, 0.9, 6.0)]
+)
+def test_friction_and_a_weak_motor_do_not_leave_a_force_error(friction, torque, force):
+    hand = {"simulation": {"joint_friction": friction, "joint_stribeck": 0.05}}
+    with VirtualGrip({}, hand, torque) as grip:
+        grip.command("arm")
+        grip.loop.advance(0.1)
+        grip.command("grasp", force=force)
+        assert grip.until("holding", 4.0)
+        assert grip.plant.force.min() > 0.89 * force
+
+
 def test_equal_seeds_give_equal_hands():
     assert drawn(7) == drawn(7)
     hands = [drawn(seed) for seed in range(1, 201)]
