@@ -188,6 +188,11 @@ class HandEstimator:
         if in_contact and tip.in_contact and not has_changed:
             contact.t_valid = frame.t_arrival
             return
+        # Report the contact as lost two frames before the limit `tactile.silent` turns torque off.
+        hidden_time = frame.t_arrival - contact.t_valid + 2.0 / self._state.frame_rate
+        is_hidden = not in_contact and self._may_hide(finger, estimate.d_std)
+        if is_hidden and hidden_time < self._state.frame_age_max:
+            return  # The contact is still predicted from joint motion.
         if in_contact and not frame_channels.update(
             self._state.array,
             self._history,
@@ -209,11 +214,28 @@ class HandEstimator:
         contact.shear_x, contact.shear_y = estimate.shear_x, estimate.shear_y
         if not in_contact:
             if tip.in_contact:
-                self.grasp.free_torque[finger] = 0.0  # measured again during the next approach
+                # The friction is measured again during the next approach.
+                tip.free_torque = 0.0
                 tip.free_torque_max[:] = 0.0
+                tip.window_start = self._state.t
             tip.in_contact = False
             self._state.mean[states.D + finger] = 0.0
             self._fill_from_frame(finger, contact, estimate)
+
+    def _may_hide(self, finger: int, d_std: float) -> bool:
+        """Return True if a held tip may be in contact although its frame shows no contact.
+
+        The zero offset of the sensor may have fallen, or noise may hide the contact. ``d_std`` is
+        the standard deviation of d in the frame [m].
+        """
+        state, tip = self._state, self._state.tip
+        if not (state.is_gripping and tip[0].in_contact and tip[1].in_contact):
+            return False
+        d, seen = np.zeros(states.STATES), np.zeros(states.STATES)
+        d[states.D + finger] = seen[states.D + finger] = seen[states.D_BIAS + finger] = 1.0
+        seen_variance = seen @ state.covariance @ seen + d_std**2
+        is_certain = d @ state.mean > states.GATE * math.sqrt(d @ state.covariance @ d)
+        return bool(is_certain and seen @ state.mean < states.GATE * math.sqrt(seen_variance))
 
     def write_contacts(self, t: float, contacts: list[Contact], pose: ObjectPose) -> None:
         """Write the estimates at time ``t`` to ``contacts`` and ``pose``."""

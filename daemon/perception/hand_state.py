@@ -489,7 +489,8 @@ def _measure_free_torque(
     """Measure the friction of a joint as the maximum torque during free motion.
 
     Readings from the last `frame_age_max` seconds are excluded, because the frames may not yet show
-    a contact that has already begun.
+    a contact that has already begun. A measurement from the previous approach is discarded once the
+    tip has been free for `frame_age_max` seconds, because a light contact may be lost for a moment.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
@@ -497,6 +498,8 @@ def _measure_free_torque(
     tip.free_torque += (tip.torque - accelerating - tip.free_torque) * weight
     tip.free_torque_max[0] = max(tip.free_torque_max[0], abs(tip.free_torque))
     if t - tip.window_start > h.frame_age_max:
+        if tip.free_torque_max[1] == 0.0:  # This is the first window of an approach.
+            h.grasp.free_torque[finger] = 0.0
         h.grasp.free_torque[finger] = max(h.grasp.free_torque[finger], tip.free_torque_max[1])
         tip.free_torque_max[1] = tip.free_torque_max[0]
         tip.free_torque_max[0] = 0.0

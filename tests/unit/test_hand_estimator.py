@@ -193,6 +193,52 @@ def test_tips_are_independent_until_a_grip_begins(estimator, depths, gripping):
         assert found == pytest.approx(depths, rel=0.01)
 
 
+NO_CONTACT = replace(ESTIMATE, contact=False, d=0.0)
+
+
+@pytest.mark.parametrize(
+    ("d", "d_std", "count", "gripping", "kept"),
+    [
+        (1e-3, 4e-4, 1, True, True),  # Noise may hide this contact.
+        (1e-3, 4e-4, 7, True, True),
+        (1e-3, 4e-4, 9, True, False),  # After 0.1 s without a usable frame, torque is switched off.
+        (3e-3, 4e-4, 1, True, False),  # The frame would show this contact.
+        (1e-3, 4e-4, 1, False, False),  # Without a grip, the object may move away.
+    ],
+)
+def test_a_contact_that_a_frame_may_hide_is_kept(estimator, d, d_std, count, gripping, kept):
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    for k in range(20 + count):
+        t = 5.0 + 0.01 * k
+        estimator.predict(Reading(t=t, q=[0.15, 0.15], valid=True), Goal() if gripping else None)
+        hidden = replace(NO_CONTACT, covariance=np.diag([d_std**2, 1.0, 1.0, 1.0]))
+        seen = replace(ESTIMATE, d=d)
+        estimator.update(0, frame(t), hidden if k >= 20 else seen, contacts[0])
+        estimator.update(1, frame(t), seen, contacts[1])
+        estimator.write_contacts(t, contacts, pose)
+    assert contacts[0].contact == kept
+    assert contacts[0].d == pytest.approx(d if kept else 0.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("gap", "kept"), [(0.02, True), (0.5, False)])
+def test_friction_is_measured_again_only_after_a_longer_gap(estimator, gap, kept):
+    """A light touch may be lost for one frame, which must not discard the measured friction."""
+    contact, t = Contact(), 5.0
+    for duration, torque, estimate in (
+        (0.5, 0.12, NO_CONTACT),
+        (0.02, 0.3, ESTIMATE),
+        (gap, 0.06, NO_CONTACT),
+        (0.02, 0.3, ESTIMATE),
+    ):
+        current = torque / SETTINGS.control.torque_constant
+        for k in range(round(duration / 0.002)):
+            t += 0.002
+            estimator.predict(Reading(t=t, dq=[0.3, 0.3], current=[current] * 2, valid=True))
+            if k % 5 == 0:
+                estimator.update(0, frame(t), estimate, contact)
+    assert estimator.grasp.free_torque[0] == pytest.approx(0.12 if kept else 0.06, rel=0.05)
+
+
 @pytest.mark.parametrize("response", [0.04, 0.08])
 def test_joint_motion_compensates_for_slow_cells(response):
     settings = Settings.model_validate({"tactile": {"response": response}})

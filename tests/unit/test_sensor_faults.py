@@ -19,21 +19,28 @@ BOTH = {"consistency.left_sensor", "consistency.right_sensor"}
 # mode. A falling zero offset hides a light touch completely, and the joints then hold their
 # positions. If only one tip seems to lose contact, the daemon rejects the frames of this tip
 # instead. A rising zero offset shows in the cells next to the footprint.
-LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
-    "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, "armed"),
-    "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, "armed"),
-    "both zeros rise": ("drift", 0.1, 1.0, (0, 1), set(), "holding"),
-    "one image shifts": ("shift-x", 3.0, 0.0, (1,), {"consistency.right_sensor"}, "fault"),
-    "both images shift": ("shift-x", 3.0, 0.0, (0, 1), BOTH, "fault"),
-    "one image is mirrored": ("mirror", 1.0, 0.0, (0,), {"consistency.left_sensor"}, "fault"),
-    "one current reads half": ("current", 0.5, 0.0, (0,), {"consistency.left_current"}, "holding"),
+LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], set[str]]] = {
+    "one zero sinks": ("drift", -0.1, 1.0, (0,), {"consistency.left_sensor"}, {"armed"}),
+    "both zeros sink": ("drift", -0.1, 1.0, (0, 1), BOTH, {"armed", "holding"}),
+    "both zeros rise": ("drift", 0.1, 1.0, (0, 1), set(), {"holding"}),
+    "one image shifts": ("shift-x", 3.0, 0.0, (1,), {"consistency.right_sensor"}, {"fault"}),
+    "both images shift": ("shift-x", 3.0, 0.0, (0, 1), BOTH, {"fault"}),
+    "one image is mirrored": ("mirror", 1.0, 0.0, (0,), {"consistency.left_sensor"}, {"fault"}),
+    "one current reads half": (
+        "current",
+        0.5,
+        0.0,
+        (0,),
+        {"consistency.left_current"},
+        {"holding"},
+    ),
     "one current reads double": (
         "current",
         2.0,
         0.0,
         (1,),
         {"consistency.right_current"},
-        "holding",
+        {"holding"},
     ),
 }
 
@@ -43,20 +50,20 @@ LIES: dict[str, tuple[str, float, float, tuple[int, ...], set[str], str]] = {
     [pytest.param(lie, marks=[pytest.mark.extended] * lie.startswith("both")) for lie in LIES],
 )
 def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
-    kind, value, over, fingers, named, mode = LIES[lie]
+    kind, value, over, fingers, named, modes = LIES[lie]
     with Hand({}) as hand:
         grasped(hand, FORCE)
         for finger in fingers:
             hand.plant.measurement_faults[finger].begin(kind, value, hand.plant.t, over)
-        seen = hand.watch(1.5)
+        seen = hand.watch(3.0)
         assert seen.force.max() < (1.4 if len(fingers) == 2 else 1.3) * FORCE
         found = {kind for _, kind, _ in hand.events if kind.startswith("consistency")}
         assert found == named
         assert not [text for _, kind, text in hand.events if kind == "slip"]
-        assert hand.mode == mode
-        if mode == "holding":
+        assert hand.mode in modes
+        if modes == {"holding"}:
             assert seen.force[-1].mean() == pytest.approx(FORCE, rel=0.1)
-        if mode == "fault":  # The daemon treats the frames as missing.
+        if modes == {"fault"}:  # The daemon treats the frames as missing.
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 
