@@ -43,6 +43,7 @@ from softfinger.daemon.perception.hand_state import (
     correct,
     interpolate,
     is_held,
+    joint_angle,
     predicted_variance,
     reset,
     reset_all,
@@ -226,7 +227,8 @@ def update(
     frame_force, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
     log_slope = stiffness / frame_force
     d, gain = _without_lag(h, found, scan, is_fitted, log_slope)
-    face = found.theta + sense * (tip.q - scan.q)  # face angle at the scan [rad]
+    q = joint_angle(h, finger) - scan.q  # joint angle at the scan [rad]
+    face = found.theta + sense * q  # face angle at the scan [rad]
     is_new_contact = not tip.in_contact
     if is_new_contact:
         tip.touch_time = h.t

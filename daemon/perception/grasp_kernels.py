@@ -41,6 +41,7 @@ from softfinger.daemon.perception.hand_state import (
     correct,
     interpolate,
     is_held,
+    joint_angle,
     motion_of,
     predicted_variance,
 )
@@ -212,7 +213,7 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     taper = h.mean[TAPER]
     angle = h.mean[ANGLE]
     motion = motion_of(h)
-    theta = angle - 0.5 * taper + left.q, angle + 0.5 * taper - right.q
+    theta = angle - 0.5 * taper + joint_angle(h, 0), angle + 0.5 * taper - joint_angle(h, 1)
     result1 = _write_tip(h, 0, theta[0], table1)
     result2 = _write_tip(h, 1, theta[1], table2)
     dt = h.t - grasp.t

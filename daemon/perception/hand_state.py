@@ -217,9 +217,16 @@ def reset_all(h: HandFilter) -> None:
 
 
 @inner_kernel
+def joint_angle(h: HandFilter, finger: int) -> float:
+    """Return the estimated angle of a joint [rad]."""
+    angle: float = h.tip[finger].q + h.mean[ENCODER + finger]
+    return angle
+
+
+@inner_kernel
 def motion_of(h: HandFilter) -> Motion:
     """Return the Jacobian of the held object; see `hand.grasp_state.held_motion`."""
-    q = h.tip[0].q, h.tip[1].q
+    q = joint_angle(h, 0), joint_angle(h, 1)
     d = h.mean[D], h.mean[D + 1]
     lengths = h.half_separation, h.length, h.offset, h.radius
     return held_motion(q, d, h.mean[ANGLE], h.mean[TAPER], lengths)
@@ -448,7 +455,8 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
     if spread == 0.0:
         return
     h.slopes[ENCODER + finger] = 1.0
-    correct(h, ENCODER_CHANNEL + finger, found - tip.q, spread * spread / 12.0, math.inf)
+    innovation = found - joint_angle(h, finger)
+    correct(h, ENCODER_CHANNEL + finger, innovation, spread * spread / 12.0, math.inf)
     tip.q += h.mean[ENCODER + finger]
     h.mean[ENCODER + finger] = 0.0
     if abs(q - tip.q) > 0.5 * h.encoder_resolution:

@@ -71,21 +71,23 @@ def test_grasps_and_turns_also_with_mass_and_modulus_off_by_30_percent(
 
 
 @pytest.mark.parametrize(
-    "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
+    ("sections", "push"),
+    [({}, 1.0), pytest.param(PAPER, 0.7, marks=pytest.mark.extended)],
+    ids=["100 Hz", "25 Hz"],
 )
-def test_a_held_object_withstands_pushes_of_a_tenth_of_the_grip_force(sections):
-    # Successive pushes of 1 N differ by up to 2 N. A sudden change of 2 N raises the grip force. To
-    # the estimator, a sideways push resembles a twist.
+def test_a_held_object_withstands_pushes_in_all_directions(sections, push):
+    # Successive pushes differ by up to twice `push`. A sudden change of 2 N raises the grip force.
+    # To the estimator, a sideways push resembles a twist. At 25 Hz, the estimate is less accurate.
     rng = np.random.default_rng(3)
     with watched(sections) as hand:
         grasped(hand)
         start = hand.plant.object_pose.copy()
         for _ in range(20):
             way = rng.uniform(-math.pi, math.pi)
-            hand.plant.apply_load(math.cos(way), math.sin(way))
+            hand.plant.apply_load(push * math.cos(way), push * math.sin(way))
             seen = hand.watch(0.25)
             assert hand.mode == "holding"
-            assert np.abs(seen.force.mean(axis=1) / 10.0 - 1.0).max() < 0.10 + KNOWN
+            assert np.abs(seen.force.mean(axis=1) / 10.0 - 1.0).max() < 0.10
         hand.plant.apply_load(0.0, 0.0)
         hand.watch(2.0)
         moved = hand.plant.object_pose - start

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import curve_fit
 
 from softfinger.daemon.perception.hand_estimator import HandEstimator
-from softfinger.daemon.perception.hand_state import STATES, HandFilter, correct
+from softfinger.daemon.perception.hand_state import ENCODER, STATES, HandFilter, correct
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Contact, Frame, Goal, ObjectPose, Reading
@@ -191,6 +191,26 @@ def test_tips_are_independent_until_a_grip_begins(estimator, depths, gripping):
         assert sum(found) < 0.8 * sum(depths)
     else:
         assert found == pytest.approx(depths, rel=0.01)
+
+
+def test_an_encoder_edge_at_the_expected_angle_changes_no_estimate(estimator):
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    state, q, error = estimator._state, 0.15, 3e-4
+    for k in range(20):
+        t = 5.0 + 0.01 * k
+        estimator.predict(Reading(t=t, q=[q, q], valid=True), Goal())
+        for finger in range(2):
+            estimator.update(finger, frame(t), ESTIMATE, contacts[finger])
+        estimator.write_contacts(t, contacts, pose)
+    # The joint crosses the edge to the next count at the angle that the filter expects.
+    state.mean[ENCODER] = error
+    state.tip[0].q = q + 0.5 * state.encoder_resolution - error
+    estimator.write_contacts(t, contacts, pose)
+    before = contacts[0].theta, contacts[0].d, pose.angle
+    t, q = t + 1e-6, q + state.encoder_resolution
+    estimator.predict(Reading(t=t, q=[q, 0.15], valid=True), Goal())
+    estimator.write_contacts(t, contacts, pose)
+    assert (contacts[0].theta, contacts[0].d, pose.angle) == pytest.approx(before, abs=1e-8)
 
 
 NO_CONTACT = replace(ESTIMATE, contact=False, d=0.0)
