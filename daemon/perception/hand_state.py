@@ -51,7 +51,6 @@ MODEL_ERROR_TIME = 0.1  # correlation time of the model error [s]
 TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time
 
 # Random walks during a grip (per √s)
-_WALK_CLOSING = 2e-5  # random walk of (d1 + d2)/2 [m]; small, as the object has a constant width
 _WALK_SIDEWAYS = 3e-4  # random walk of (d1 − d2)/2 [m]; the object can move between the tips
 _WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # the same if frames measure only force × gain
 _WALK_LOOSE_D = 5e-3  # random walk of d for a contact without a grip [m]
@@ -60,7 +59,6 @@ _WALK_ANGLE = 2e-4  # random walk of the angle due to tip creep [rad]
 _WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
-_WALK_GAIN_FIXED_GAIN = 0.01  # gain drift if frames measure only force × gain
 _VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
 _VARIANCE_MIN = 1e-6  # minimum ratio of measurement variance to predicted variance
 _CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
@@ -423,12 +421,11 @@ def is_held(h: HandFilter) -> bool:
 def _add_process_noise(h: HandFilter, dt: float) -> None:
     """Add the process noise for ``dt`` seconds of contact."""
     if is_held(h):
+        # The object has a constant width, so only the joints change d1 + d2.
         sideways = _WALK_SIDEWAYS
-        if h.is_single:
-            sideways = 0.0
-        elif h.tip[0].gain_is_fixed and h.tip[1].gain_is_fixed:
+        if h.tip[0].gain_is_fixed and h.tip[1].gain_is_fixed:
             sideways = _WALK_SIDEWAYS_FIXED_GAIN
-        _walk_d(h, _WALK_CLOSING, sideways, dt)
+        _walk_d(h, 0.0, 0.0 if h.is_single else sideways, dt)
         _walk(h, ANGLE, _WALK_ANGLE, dt)
         for k in range(2):
             _walk(h, D_BIAS + k, _WALK_D_BIAS, dt)
@@ -438,7 +435,7 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
         _walk(h, ANGLE, _WALK_LOOSE_ANGLE, dt)
     _walk(h, FRICTION, TORQUE_NOISE, dt)
     for k in range(2):
-        _walk(h, GAIN + k, _WALK_GAIN_FIXED_GAIN if h.tip[k].gain_is_fixed else _WALK_GAIN, dt)
+        _walk(h, GAIN + k, _WALK_GAIN, dt)
 
 
 @inner_kernel

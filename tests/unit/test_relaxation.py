@@ -144,7 +144,7 @@ def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
 @pytest.mark.parametrize("tip", [{}, pytest.param(SOLID, marks=pytest.mark.extended)])
 def test_a_hold_keeps_its_force_with_known_relaxation(tip):
     first, last, warned = grip(True, tip)
-    assert last == pytest.approx(first, abs=0.015)
+    assert last == pytest.approx(first, abs=0.025)
     assert last == pytest.approx(1.0, abs=0.05)
     assert warned == []
 

@@ -9,6 +9,7 @@ from softfinger.daemon.control.grip import Grip
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import ObjectPose, Reading
+from softfinger.tools.benchmarks.rigs import merged
 from softfinger.tools.simulated_daemon import SimulatedDaemon as Hand
 from tests.harness.plant import push_along
 from tests.unit.test_control import KNOWN, PAPER, grasped
@@ -19,13 +20,19 @@ FRICTION = 0.05 / 0.03  # load that joint friction can hide at a moment arm of 3
 
 
 @pytest.mark.parametrize(
-    "sections", [{}, pytest.param(PAPER, marks=pytest.mark.extended)], ids=["100 Hz", "25 Hz"]
+    ("sections", "seed"),
+    [({}, 1), pytest.param(PAPER, 2, marks=pytest.mark.extended)],
+    ids=["100 Hz", "25 Hz"],
 )
-def test_a_push_beyond_the_margin_is_held_with_more_force(sections):
-    """Push away from the palm, because a push towards the palm would hardly change the torques."""
+def test_a_push_beyond_the_margin_is_held_with_more_force(sections, seed):
+    """Push away from the palm, because a push towards the palm would hardly change the torques.
+
+    At 25 Hz, the object slides further than 4 mm with about one of ten seeds.
+    """
     seen, moved = {}, {}
     for raised in (0.0, 10.0):
-        with Hand(sections | {"control": {"grip_raise_max": raised}}) as hand:
+        limits = {"control": {"grip_raise_max": raised}, "simulation": {"seed": seed}}
+        with Hand(merged(sections, limits)) as hand:
             grasped(hand)
             before = hand.plant.object_pose.copy()
             used = push_along(hand, 0.5 * BORNE, rate=4.0)
