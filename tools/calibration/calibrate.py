@@ -167,17 +167,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _calibrate_profile(arguments: argparse.Namespace, settings: Settings) -> str:
-    if arguments.step == "friction":
-        from softfinger.tools.calibration.friction import calibrate_friction
-
-        return calibrate_friction(arguments, settings)
-    if arguments.step == "latency":
-        from softfinger.tools.calibration.latency import calibrate_latency
-
-        return calibrate_latency(arguments, settings)
+    from softfinger.tools.calibration.friction import calibrate_friction
     from softfinger.tools.calibration.joints import calibrate_heat, calibrate_joints
+    from softfinger.tools.calibration.latency import calibrate_latency
 
-    return (calibrate_heat if arguments.step == "heat" else calibrate_joints)(arguments, settings)
+    steps = {
+        "joints": calibrate_joints,
+        "heat": calibrate_heat,
+        "friction": calibrate_friction,
+        "latency": calibrate_latency,
+    }
+    return steps[arguments.step](arguments, settings)
 
 
 def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
