@@ -23,15 +23,8 @@ from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel_folder import is_marked, kernel_folder, mark
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
-from softfinger.kinematics.hand.geometry import tip_position
 from softfinger.kinematics.hand.grasp_state import total_tilt
-from softfinger.kinematics.hand.servo_heat import (
-    HeatState,
-    follow,
-    sustained_square,
-    time_to_limit,
-    winding_std,
-)
+from softfinger.kinematics.hand.servo_heat import HeatState, follow, time_to_limit
 
 
 class WantedScene:
@@ -196,10 +189,7 @@ def _joints(scene: WantedScene) -> None:
     set_law(heat.law, scene.settings)
     for _ in range(2):
         follow(heat.array, 1.0, 0.5, 25.0)
-    winding_std(heat.array)
     time_to_limit(heat.array, 1.0, 70.0)
-    sustained_square(heat.array, 70.0)
-    tip_position(0.0, 1.0, 0.0, 1.0, 0.0)  # for the joint.opens limit
     Setpoint(1.0 / scene.settings.loop.rate, scene.settings.control.smooth_time, SetpointState())
     Statistics()
 
@@ -214,7 +204,7 @@ _HAND = Part("simulated hand", 64, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
 _FILTER = Part("contact filter", 25, _filter, after=_TABLE.name)
 _GRIP = Part("grip", 26, _grip)
-_JOINTS = Part("joints and timing", 13, _joints)
+_JOINTS = Part("joints and timing", 10, _joints)
 _MANY = Part("lookup of many points", 3, _many, after=_TABLE.name)
 ALL = (_TABLE, _ESTIMATOR, _HAND, _SENSOR, _FILTER, _GRIP, _JOINTS, _MANY)
 EMULATED = (_TABLE, _HAND, _SENSOR)  # parts used by `softfinger emulate`

@@ -194,22 +194,27 @@ def load_calibration(path: Path) -> Calibration:
     return calibration
 
 
-def calibration_for(settings: Settings, finger: int) -> Calibration | None:
-    """Return the calibration of a finger's sensor, or None if the settings contain no file name.
+def calibration_of(sensor: Sensor, path: Path) -> Calibration:
+    """Read the calibration file of ``sensor``.
 
     Raises CalibrationFileError if the file can't be read or belongs to another sensor.
     """
-    name = settings.tactile.calibration[finger]
-    if not name:
-        return None
-    calibration = load_calibration(Path(name))
-    wrong = difference(calibration.sensor, sensor_of(settings, finger))
-    if wrong:
-        raise CalibrationFileError(f"{name}: the calibration belongs to another sensor: {wrong}")
+    calibration = load_calibration(path)
+    if wrong := _difference(calibration.sensor, sensor):
+        raise CalibrationFileError(f"{path}: the calibration belongs to another sensor: {wrong}")
     return calibration
 
 
-def difference(file: Sensor, there: Sensor) -> str:
+def calibration_for(settings: Settings, finger: int) -> Calibration | None:
+    """Return the calibration of a finger's sensor, or None if the settings contain no file name.
+
+    Raises CalibrationFileError as `calibration_of` does.
+    """
+    name = settings.tactile.calibration[finger]
+    return calibration_of(sensor_of(settings, finger), Path(name)) if name else None
+
+
+def _difference(file: Sensor, there: Sensor) -> str:
     """Describe the differences between two sensors; return "" if the sensors are identical."""
     pairs = [
         ("finger", file.finger, there.finger),
@@ -285,20 +290,20 @@ class Converter:
         x = np.abs(readings)
         return np.asarray(np.sign(readings) * (c1 * x**exponent + c2 * x**2 + c3 * x**3))
 
-    def at(self, count: int) -> FloatArray:
-        """Return a new array with each cell's pressure [Pa] at a reading of ``count``."""
-        return self(np.full(self.zero.shape, count, np.uint16))
+    def _ends(self) -> FloatArray:
+        """Return each cell's pressure [Pa] at saturation."""
+        return self(np.full(self.zero.shape, self._full, np.uint16))
 
     @property
     def saturation(self) -> float:
         """Lowest pressure [Pa] at which a live cell saturates; see :func:`least_end`."""
-        pressure = self.at(self._full)[self.live]
+        pressure = self._ends()[self.live]
         return least_end(pressure) if pressure.size else np.inf
 
     @property
     def largest(self) -> float:
         """Highest pressure [Pa] that any cell can measure."""
-        return float(self.at(self._full).max())
+        return float(self._ends().max())
 
     @property
     def quantum(self) -> float:

@@ -113,7 +113,7 @@ class HeatWatch:
             heat, estimate = self._states[i], self._state.heat[i]
             temperatures = heat.x[[WINDING, CASE, AMBIENT]].tolist()
             estimate.winding, estimate.case, estimate.ambient = temperatures
-            estimate.winding_std = winding_std(heat.array)
+            estimate.winding_std = winding_std(heat)
             estimate.case_std = math.sqrt(heat.p.item(CASE, CASE))
             limit = self._limits.temperature_max - _HALF_STEP
             estimate.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
@@ -137,9 +137,7 @@ class HeatWatch:
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
             return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
-        square = sustained_square(
-            self._states[i].array, self._limits.temperature_max - _TARGET_MARGIN
-        )
+        square = sustained_square(self._states[i], self._limits.temperature_max - _TARGET_MARGIN)
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))
         eased = max(min(lasts, now), _FRACTION_MIN * now, control.grip.force_for_load())
         if eased < _FRACTION_MAX * now:

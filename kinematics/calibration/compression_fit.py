@@ -273,8 +273,8 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
     pairs = [*zip(runs, used, strict=True)]
     d = np.concatenate([run.d[rows] for run, rows in pairs])
     force = np.concatenate([run.force[rows] for run, rows in pairs])
-    tilt = np.concatenate([np.full(np.count_nonzero(rows), run.theta) for run, rows in pairs])
     owner = np.repeat(np.arange(len(runs)), [np.count_nonzero(rows) for rows in used])
+    tilt = np.array([run.theta for run in runs])[owner]
     own = (owner[:, None] == np.arange(len(runs))).astype(np.float64)
     begins, count = np.array([run.begin for run in runs]), len(tables)
     longest = _CLIP * np.array([run.depth for run in runs])

@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.calibration.calibration import CalibrationError
-from softfinger.kinematics.hand.servo_heat import COPPER, HeatLaw
+from softfinger.kinematics.hand.servo_heat import (
+    COPPER,
+    ROOM_TEMPERATURE,
+    HeatLaw,
+    convection_factor,
+)
 
 _PRIOR_STD = (0.4, 0.4, 3.0)  # prior σ of rise and time (relative), and of ambient temperature [°C]
 # Standard deviation of a reading [°C], including the rounding to whole degrees.
@@ -48,8 +53,9 @@ def forecast(
     for square in squares.tolist():
         out.append(case)
         flow, over = (winding - case) / inner, case - ambient
-        winding += _STEP * (heating * square * (1.0 + COPPER * (winding - 25.0)) - flow)
-        case += _STEP * (law.share * flow - over * (max(over, 1.0) / 30.0) ** 0.25 / outer)
+        copper = 1.0 + COPPER * (winding - ROOM_TEMPERATURE)
+        winding += _STEP * (heating * square * copper - flow)
+        case += _STEP * (law.share * flow - over * convection_factor(over) / outer)
     return np.array(out)
 
 

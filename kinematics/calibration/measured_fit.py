@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger import SoftfingerError
+from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.tip_curves import POWERS, SQUARES, Curve, TipCurves, rises
 from softfinger.kinematics.estimation.measured import sum_weights
@@ -21,10 +21,6 @@ _UPRIGHT_TILT = math.radians(1.0)
 _TILTED_MIN = math.radians(5.0)
 _CURVE_ERROR_MAX = 0.05  # maximum error of the curves, relative to the force or the radius
 _STAGE_ERROR = 2e-3  # assumed relative error of the test stage and its force sensor
-
-
-class CurvesError(SoftfingerError, ValueError):
-    """Error raised if the presses do not determine valid curves."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +43,11 @@ class PressSums:
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:
-    """Fit the curves of a tip, and the position of the tip on the sensor ``grid``.
+    """Fit the curves of a tip, and the position of the tip on the sensor.
 
-    Raises CurvesError.
+    ``grid`` is the sensor grid without offset or rotation.
+
+    Raises CalibrationError.
     """
     used = presses.d > 0.0
     d, theta = presses.d[used], presses.theta[used]
@@ -60,16 +58,14 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
         or tilted.sum() < 2
         or not (np.abs(theta) < _UPRIGHT_TILT).any()
     ):
-        raise CurvesError(
+        raise CalibrationError(
             f"found {len(d)} presses at {len(np.unique(d))} depths, {tilted.sum()} of them "
             f"tilted; expected at least {_PRESS_COUNT_MIN} presses at 3 depths, including upright "
             "presses and 2 presses tilted by 5° or more"
         )
     frames = [each for each, use in zip(presses.frames, used, strict=True) if use]
-    first = replace(grid, centre=(0.0, 0.0), rotation=0.0)
-    centre, rotation = _place(
-        _sums(frames, sum_weights(first, radius, presses.active), presses.rest), theta
-    )
+    weights = sum_weights(grid, radius, presses.active)
+    centre, rotation = _place(_sums(frames, weights, presses.rest), theta)
     placed = replace(grid, centre=centre, rotation=rotation)
     weights = sum_weights(placed, radius, presses.active)
     sums = _sums(frames, weights, presses.rest)
@@ -93,7 +89,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
             (t, q, times), y, np.hypot(sigma, _STAGE_ERROR * np.abs(y)), powers, squares, valid
         )
         if best is None:
-            raise CurvesError(f"no smooth increasing curve fits the presses ({name})")
+            raise CalibrationError(f"no smooth increasing curve fits the presses ({name})")
         return tuple(map(tuple, best.tolist()))
 
     one = np.ones(len(d))
@@ -131,7 +127,7 @@ def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurv
     ]
     force_error, lever_error = max(missed[:2]), max(missed[2:])
     if max(force_error, lever_error / radius) > _CURVE_ERROR_MAX:
-        raise CurvesError(
+        raise CalibrationError(
             "the best-fitting smooth, increasing curves differ from the presses by "
             f"{force_error:.1%} in force and {lever_error * 1e3:.2f} mm in centroid position"
         )
@@ -153,7 +149,7 @@ def _sums(frames: Sequence[FloatArray], weights: FloatArray, rest: FloatArray) -
 def _noise(frames: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """Estimate the covariance [4, 4] of one frame's sums from the scatter within each press."""
     if min(map(len, frames)) < 5:
-        raise CurvesError(
+        raise CalibrationError(
             "expected at least five frames for each press, so that the noise can be measured"
         )
     each = [weights @ every.reshape(len(every), -1).T for every in frames]

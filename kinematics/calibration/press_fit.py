@@ -6,7 +6,7 @@ The tip's forward model is fitted to all cells of all frames by least squares.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -277,24 +277,20 @@ def fit_place(
     if rotate:
         turns = 2.0 * math.pi * np.arange(_ROTATION_STARTS) / _ROTATION_STARTS
         grid = min((replace(grid, rotation=float(each)) for each in turns), key=misfit)
-    owner = np.broadcast_to(
-        np.arange(len(depths))[:, None, None], presses.used.shape
-    )[presses.used]  # fmt: skip
+    owner = np.nonzero(presses.used)[0]
     shift = math.inf
     for _ in range(12):
         now = gain * presses.of(tip, grid, depths)
         by_depth = (gain * presses.of(tip, grid, depths + _STEP) - now) / _STEP
         columns = [np.where(owner == k, by_depth, 0.0) for k in range(len(depths))]
         x, y = grid.centre
-        tried: Sequence[tuple[SensorGrid, float]] = [
+        tried = [
             (replace(grid, centre=(x + _PLACE_STEP, y)), _PLACE_STEP),
             (replace(grid, centre=(x, y + _PLACE_STEP)), _PLACE_STEP),
         ]
         if rotate:
-            tried = [
-                *tried,
-                (replace(grid, rotation=grid.rotation + _ROTATION_STEP), _ROTATION_STEP),
-            ]
+            turned = replace(grid, rotation=grid.rotation + _ROTATION_STEP)
+            tried.append((turned, _ROTATION_STEP))
         columns += [(gain * presses.of(tip, each, depths) - now) / step for each, step in tried]
         columns += [now] * free_gain
         jacobian = np.stack(columns, axis=1)
@@ -302,9 +298,9 @@ def fit_place(
         step, place = found[: len(depths)], found[len(depths) :]
         gain *= 1.0 + float(np.clip(place[-1], -0.3, 0.3)) * free_gain
         depths = np.clip(depths + step, 0.3 * depths, 0.95 * tip.radius)
-        shift = math.hypot(*np.clip(place[:2], -2e-3, 2e-3))
         rotation = grid.rotation + (float(np.clip(place[2], -0.5, 0.5)) if rotate else 0.0)
         x_step, y_step = np.clip(place[:2], -2e-3, 2e-3).tolist()
+        shift = math.hypot(x_step, y_step)
         grid = replace(grid, centre=(x + x_step, y + y_step), rotation=rotation)
         if shift < 1e-7:
             break

@@ -69,7 +69,8 @@ class Record(metaclass=_Slotted):
         # Align fields as in C, because Numba accesses unaligned fields slowly.
         cls.dtype = np.dtype([(name, *kind) for name, (_, *kind) in kinds.items()], align=True)
         for name, (inner, _, shape) in kinds.items():
-            setattr(cls, name, _field(name, inner, shape))
+            is_scalar = inner is None and not shape
+            setattr(cls, name, _Scalar(name) if is_scalar else _Compound(name, inner))
 
     def __init__(self, array: NDArray[np.void] | None = None) -> None:
         """Create a record of zeros or a view of the first record in ``array``."""
@@ -135,10 +136,6 @@ class _Compound:
         if self.inner is not None:
             raise AttributeError(f"{self._name} is a record: set the individual fields")
         record._fields[self._name][...] = value
-
-
-def _field(name: str, inner: Any, shape: tuple[int, ...]) -> Any:
-    return _Scalar(name) if inner is None and not shape else _Compound(name, inner)
 
 
 def _kind(hint: Any) -> tuple[Any, Any, tuple[int, ...]]:

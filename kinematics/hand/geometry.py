@@ -26,14 +26,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softfinger.kinematics.compiled.kernel import kernel
-
 __all__ = ["HandGeometry"]
 
 FloatArray = NDArray[np.float64]
 
 
-@kernel
 def tip_position(
     q: float, side: float, half_separation: float, length: float, offset: float
 ) -> tuple[float, float]:
@@ -47,7 +44,6 @@ def tip_position(
     return x, length * cosine - offset * sine
 
 
-@kernel
 def tip_velocity(q: float, side: float, length: float, offset: float) -> tuple[float, float]:
     """Return (∂x/∂q, ∂y/∂q) [m/rad] of a tip centre; see `tip_position` for ``side``."""
     sine = math.sin(q)

@@ -25,6 +25,7 @@ from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 FloatPair = tuple[float, float]  # (left, right)
 Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
 
+_tip_position, _tip_velocity = inner_kernel(tip_position), inner_kernel(tip_velocity)
 _SHEAR_STEPS = 3  # number of iterations for the shear forces; each one gains two digits
 
 
@@ -70,10 +71,10 @@ def held_motion(
     ny = math.sin(angle)
     face_slope = math.tan(0.5 * taper)
     longer = math.sqrt(1.0 + face_slope * face_slope)
-    x1, y1 = tip_position(q1, 1.0, half_separation, length, offset)
-    x2, y2 = tip_position(q2, -1.0, half_separation, length, offset)
-    vx1, vy1 = tip_velocity(q1, 1.0, length, offset)
-    vx2, vy2 = tip_velocity(q2, -1.0, length, offset)
+    x1, y1 = _tip_position(q1, 1.0, half_separation, length, offset)
+    x2, y2 = _tip_position(q2, -1.0, half_separation, length, offset)
+    vx1, vy1 = _tip_velocity(q1, 1.0, length, offset)
+    vx2, vy2 = _tip_velocity(q2, -1.0, length, offset)
     across = d1 + d2 - 2.0 * radius + longer * ((x2 - x1) * nx + (y2 - y1) * ny)
     bounded = max(across, 0.5 * radius)
     return (

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 WINDING, CASE, AMBIENT, HEATING = range(4)
 COPPER = 0.0039  # temperature coefficient of the winding's resistance [1/K]
 TIME_MAX = 3600.0  # upper bound on the computed time to a temperature limit [s]
-_ROOM_TEMPERATURE = 25.0  # °C
+ROOM_TEMPERATURE = 25.0  # °C
 _CONVECTION_DIFFERENCE = 30.0  # difference from ambient temperature at which τ_c is defined [K]
 _INITIAL_STD = (6.0, 0.5, 8.0, 0.35)  # initial standard deviations of W, C, A [°C] and k
 _RANDOM_WALK = (0.03, 0.01, 0.2, 0.01)  # random walks of W, C, A [°C/√s] and k [1/√s]
@@ -67,7 +67,7 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
         for i in range(4):
             s.p[i, i] = _INITIAL_STD[i] * _INITIAL_STD[i]
         s.x[WINDING] = s.x[CASE] = reading
-        s.x[AMBIENT] = min(reading, _ROOM_TEMPERATURE)
+        s.x[AMBIENT] = min(reading, ROOM_TEMPERATURE)
         s.x[HEATING] = 1.0
         return
     _predict(s, square, dt)
@@ -81,16 +81,18 @@ def follow(states: Records[HeatState], square: float, dt: float, reading: float)
     s.reading = reading
 
 
-@inner_kernel
-def _convection_factor(over: float) -> float:
+def convection_factor(over: float) -> float:
     """Return the convection factor g for a case ``over`` K (at least 1 K) above ambient."""
     return math.sqrt(math.sqrt(max(over, 1.0) / _CONVECTION_DIFFERENCE))
+
+
+_convection_factor = inner_kernel(convection_factor)
 
 
 @inner_kernel
 def _predict(s: HeatState, square: float, dt: float) -> None:
     law, x, p, f = s.law, s.x, s.p, s.scratch
-    heating = law.heating * square * (1.0 + COPPER * (x[WINDING] - _ROOM_TEMPERATURE))
+    heating = law.heating * square * (1.0 + COPPER * (x[WINDING] - ROOM_TEMPERATURE))
     flow = (x[WINDING] - x[CASE]) / law.winding_time
     loss = _convection_factor(x[CASE] - x[AMBIENT]) / law.case_time
     f[:] = 0.0
@@ -133,10 +135,8 @@ def _correct(s: HeatState, case: float, variance: float) -> None:
     x[HEATING] = max(x[HEATING], 0.1)
 
 
-@kernel
-def winding_std(states: Records[HeatState]) -> float:
+def winding_std(s: HeatState) -> float:
     """Return the standard deviation of the winding temperature [°C]."""
-    s = states[0]
     coupling = _COUPLING * (s.x[WINDING] - s.x[CASE])
     return math.sqrt(max(s.p[WINDING, WINDING], 0.0) + coupling * coupling)
 
@@ -157,7 +157,7 @@ def time_to_limit(states: Records[HeatState], square: float, limit: float) -> fl
         if case >= limit:
             return t
         dt = 1.0 + 0.02 * t
-        source = heating * (1.0 - COPPER * _ROOM_TEMPERATURE) + case / law.winding_time
+        source = heating * (1.0 - COPPER * ROOM_TEMPERATURE) + case / law.winding_time
         loss = 1.0 / law.winding_time - heating * COPPER
         winding = (winding + dt * source) / max(1.0 + dt * loss, 0.1)
         outward = (case - ambient) * _convection_factor(case - ambient) / law.case_time
@@ -170,14 +170,11 @@ def time_to_limit(states: Records[HeatState], square: float, limit: float) -> fl
     return TIME_MAX
 
 
-@kernel
-def sustained_square(states: Records[HeatState], limit: float) -> float:
+def sustained_square(s: HeatState, limit: float) -> float:
     """Return the mean squared current [A²] at which the case settles at ``limit`` [°C]."""
-    s = states[0]
     law = s.law
     over = max(limit - s.x[AMBIENT], 0.0)
-    flow = over * _convection_factor(over) / (law.case_time * law.share)  # (W − C)/τ_w [K/s]
+    flow = over * convection_factor(over) / (law.case_time * law.share)  # (W − C)/τ_w [K/s]
     winding = limit + flow * law.winding_time
-    heating = law.heating * s.x[HEATING] * (1.0 + COPPER * (winding - _ROOM_TEMPERATURE))
-    square: float = flow / heating
-    return square
+    heating = law.heating * s.x[HEATING] * (1.0 + COPPER * (winding - ROOM_TEMPERATURE))
+    return float(flow / heating)

@@ -22,10 +22,14 @@ from research.solid_tip.green import RING_EDGES, green, shear_response
 
 Arrays = dict[str, NDArray[Any]]
 
-BASES = ("bonded", "lying")
 STICKING = "-sticking"
-BLOCKS = tuple(base + face for face in ("", STICKING) for base in BASES)
-HELD_OUT = (0.458, 0.49, 0.4995)  # values of ν used only for validation
+# Number of elements along the arc for each combination of base and face.
+BLOCKS = {"bonded": 64, "lying": 64, "bonded-sticking": 48, "lying-sticking": 48}
+NODES = fit.chebyshev_nodes(*fit.NU, 4)  # fitted values of ν
+# Values of ν and number of elements of the presses used only for validation. Their differences from
+# the model include both the error of the fit and the error of the mesh.
+HELD_OUT, HELD_OUT_RINGS = (0.458, 0.49, 0.4995), 32
+TOLERANCE = 1.2e-3  # tolerance of the modes
 
 
 def presses(which: tuple[str, int, float], folder: Path) -> fit.Samples:
@@ -61,87 +65,42 @@ def differences(tip: SolidTip, samples: fit.Samples) -> str:
     return "; ".join(text)
 
 
-def mesh_errors(arrays: Arrays, other: Arrays, block: str) -> tuple[float, float]:
-    """Return the maximum relative differences in N and in a sensor frame between two models."""
-    force, pressure = [], []
-    for poisson in (*fit.NU, 0.49):
-        tip, second = SolidTip(arrays, block, poisson), SolidTip(other, block, poisson)
-        for d in (0.005, 0.025, 0.1, 0.25, fit.D_MAX):
-            for theta in (0.0, 0.3, fit.THETA_MAX):
-                (push, _, one), (its_push, _, two) = tip.press(d, theta), second.press(d, theta)
-                force.append(abs(its_push / push - 1))
-                frames = (each.frame(p, 0.066, 44) for each, p in ((second, two), (tip, one)))
-                pressure.append(rms_difference(*frames))
-    return max(force), max(pressure)
-
-
 def main() -> None:
     """Compute the presses, fit the model, write the file and print the model's errors."""
     parser = argparse.ArgumentParser(prog="python -m research.solid_tip", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write, .npz")
-    parser.add_argument("--rings", type=int, default=64, help="number of elements along the arc")
-    parser.add_argument(
-        "--sticking", type=int, default=48, help="number of elements along a sticking face"
-    )
-    parser.add_argument(
-        "--coarser", type=int, default=32, help="number of elements for estimating the mesh error"
-    )
-    parser.add_argument(
-        "--held-out", type=int, default=32, help="number of elements for unfitted presses"
-    )
-    parser.add_argument("--nodes", type=int, default=4, help="number of values of ν")
-    parser.add_argument("--tolerance", type=float, default=1.2e-3, help="tolerance of the modes")
     parser.add_argument(
         "--folder", type=Path, required=True, help="folder for the results of presses"
     )
-    parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    nodes = fit.chebyshev_nodes(*fit.NU, arguments.nodes)
-    finest = {each: arguments.sticking if STICKING in each else arguments.rings for each in BLOCKS}
     work = [
-        *((block, rings, nu) for block in BLOCKS for rings in (arguments.coarser, finest[block])
-          for nu in nodes),
-        *product(BLOCKS, [arguments.held_out], HELD_OUT),
-    ]  # fmt: skip
-    with ProcessPoolExecutor(arguments.processes) as pool:
-        samples = dict(
-            zip(work, pool.map(presses, work, [arguments.folder] * len(work)), strict=True)
-        )
-
-    def fitted(block: str, rings: int) -> Arrays:
-        part = [samples[block, rings, poisson] for poisson in nodes]
-        found = fit.fit(part, nodes, np.pi / 2 / rings, arguments.tolerance)
-        bonded, shear = block.startswith("bonded"), []
-        for poisson in nodes:
-            radius, pressure = shear_response(rings, poisson, bonded)
-            shear.append(fit.ring_means(radius) @ pressure)
-        found["shear"] = fit.over_nu(np.array(shear)).astype(np.float32)
-        return shared | {f"{block}.{name}": value for name, value in found.items()}
-
-    shared = {
+        *((block, rings, poisson) for block, rings in BLOCKS.items() for poisson in NODES),
+        *product(BLOCKS, [HELD_OUT_RINGS], HELD_OUT),
+    ]
+    with ProcessPoolExecutor(2) as pool:
+        folders = [arguments.folder] * len(work)
+        samples = dict(zip(work, pool.map(presses, work, folders), strict=True))
+    arrays: Arrays = {
         "s_max": np.array(fit.S_MAX),
         "theta_max": np.array(fit.THETA_MAX),
         "nu_range": np.array(fit.NU),
         "ring_edges": RING_EDGES,
     }
-    arrays: Arrays = {}
-    rows = []
-    for block in BLOCKS:
-        one, other = (fitted(block, rings) for rings in (finest[block], arguments.coarser))
-        arrays |= one
-        errors = mesh_errors(one, other, block)
-        for name, value in zip(("force_error", "pressure_error"), errors, strict=True):
-            arrays[f"{block}.{name}"] = np.array(value)
-        for (its, rings, poisson), each in samples.items():
-            if its == block:
-                told = "" if poisson in nodes else " (not fitted)"
-                tip = SolidTip(one if rings == finest[block] else other, block, poisson)
-                rows.append(
-                    f"{block}, {rings} elements, ν {poisson:.4f}{told}: {differences(tip, each)}"
-                )
+    for block, rings in BLOCKS.items():
+        part = [samples[block, rings, poisson] for poisson in NODES]
+        found = fit.fit(part, NODES, np.pi / 2 / rings, TOLERANCE)
+        shear = []
+        for poisson in NODES:
+            radius, pressure = shear_response(rings, poisson, block.startswith("bonded"))
+            shear.append(fit.ring_means(radius) @ pressure)
+        found["shear"] = fit.over_nu(np.array(shear)).astype(np.float32)
+        arrays |= {f"{block}.{name}": value for name, value in found.items()}
     np.savez_compressed(arguments.out, **arrays)  # type: ignore[arg-type]
-    print("\n".join(rows))
+    for (block, rings, poisson), each in samples.items():
+        told = " (not fitted)" if rings == HELD_OUT_RINGS else ""
+        errors = differences(SolidTip(arrays, block, poisson), each)
+        print(f"{block}, {rings} elements, ν {poisson:.4f}{told}: {errors}")
 
 
 if __name__ == "__main__":

@@ -210,26 +210,23 @@ class SolidTip:
         stick = float(chebyshev.chebval2d(x, w, self.coef[0]))
         return stick * float(np.sin(theta) * np.cos(theta))
 
-    def frame(self, pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
-        """Average the pressure over the cells of a square grid under the tip, with rows along y."""
-        parts, turns = 10, 2000  # numbers of radial and angular pieces per ring
-        edges = np.interp(
-            np.arange(parts * (self.edges.size - 1) + 1) / parts,
-            np.arange(self.edges.size),
-            self.edges,
-        )
-        r = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2)[:, None]
-        phi = 2 * np.pi * (np.arange(turns) + 0.5) / turns
-        share = np.repeat(pressure, parts, axis=1).T @ np.cos(
-            np.arange(len(pressure))[:, None] * phi
-        )
-        share *= (np.diff(edges**2) * np.pi / turns / pitch**2)[:, None]
-        column, row = (
-            np.floor(r * f(phi) / pitch).astype(int) + cells // 2 for f in (np.cos, np.sin)
-        )
-        out = np.zeros((cells, cells))
-        np.add.at(out, (row, column), share)
-        return out
+
+def cell_means(pressure: FloatArray, pitch: float, cells: int) -> FloatArray:
+    """Average the base pressure over the cells of a square grid, with rows along y."""
+    parts, turns = 10, 2000  # numbers of radial and angular pieces per ring
+    edges = np.interp(
+        np.arange(parts * (RING_EDGES.size - 1) + 1) / parts,
+        np.arange(RING_EDGES.size),
+        RING_EDGES,
+    )
+    r = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2)[:, None]
+    phi = 2 * np.pi * (np.arange(turns) + 0.5) / turns
+    share = np.repeat(pressure, parts, axis=1).T @ np.cos(np.arange(len(pressure))[:, None] * phi)
+    share *= (np.diff(edges**2) * np.pi / turns / pitch**2)[:, None]
+    column, row = (np.floor(r * f(phi) / pitch).astype(int) + cells // 2 for f in (np.cos, np.sin))
+    out = np.zeros((cells, cells))
+    np.add.at(out, (row, column), share)
+    return out
 
 
 def rms_difference(one: ArrayLike, other: ArrayLike) -> float:

@@ -13,8 +13,8 @@ the discontinuous pressure eliminated). This projection avoids locking as ν app
 
 from __future__ import annotations
 
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, reduce
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,28 @@ RING_EDGES = np.sin(np.linspace(0, np.pi / 2, 97))
 RING_EDGES = np.concatenate([RING_EDGES, 2 - RING_EDGES[RING_EDGES > 0.8][-2::-1]])
 MIDDLES = (RING_EDGES[1:] + RING_EDGES[:-1]) / 2
 
-GAUSS = np.polynomial.legendre.leggauss(3)
+GAUSS: tuple[FloatArray, FloatArray] = np.polynomial.legendre.leggauss(3)
 
 
 def quadratic(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the quadratic shape functions on [−1, 1] and their derivatives at ``x``, (n, 3)."""
     values = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
     return values, np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
+
+
+def shape_functions(dimensions: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the products of quadratic shape functions in several dimensions at the Gauss points.
+
+    Returns
+    -------
+    Values [points, nodes], gradients [points, nodes, dimensions] and weights [points].
+    """
+    kron: Any = np.kron
+    value, slope = quadratic(GAUSS[0])
+    axes = range(dimensions)
+    rows = [[slope if k == axis else value for k in axes] for axis in axes]
+    gradients = np.stack([reduce(kron, row) for row in rows], axis=-1)
+    return reduce(kron, [value] * dimensions), gradients, reduce(kron, [GAUSS[1]] * dimensions)
 
 
 def graded(last: float, widest: float, growth: float, length: float) -> FloatArray:
@@ -83,17 +98,12 @@ class Meridian:
     @cached_property
     def _geometry(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return shape values (9, 9), gradients (e, q, 9, 2), r (e, q) and weights r dA (e, q)."""
-        points, weights = GAUSS
-        value, slope = quadratic(points)
-        shape = np.einsum("pa,qb->pqab", value, value).reshape(9, 9)
-        local = np.stack(
-            [np.einsum("pa,qb->pqab", slope, value), np.einsum("pa,qb->pqab", value, slope)], -1
-        ).reshape(9, 9, 2)
+        shape, local, weights = shape_functions(2)
         corners = self.nodes[self.elements]
         jacobian = np.einsum("qnk,enx->eqxk", local, corners)
         gradient = np.einsum("qnk,eqkx->eqnx", local, np.linalg.inv(jacobian))
         r = np.einsum("qn,en->eq", shape, corners[:, :, 0])
-        area = np.abs(np.linalg.det(jacobian)) * np.outer(weights, weights).ravel()
+        area = np.abs(np.linalg.det(jacobian)) * weights
         return shape, gradient, r, area * r
 
     def stiffness(self, m: int, poisson: float) -> sparse.csc_matrix:

@@ -26,13 +26,13 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.sparse.linalg import spsolve
 
 from research.solid_tip.green import (
-    GAUSS,
     MIDDLES,
     FloatArray,
     IntArray,
     Meridian,
     base_mass,
     quadratic,
+    shape_functions,
 )
 
 WEDGE = 0.1  # angle of the wedge [rad]
@@ -146,26 +146,11 @@ class Body:
 
     def _geometry(self) -> FloatArray:
         """Set weights and linear functions; return the shape-function gradients (e, q, 27, 3)."""
-        points, gauss = GAUSS
-        value, slope = quadratic(points)
-
-        def product(*parts: FloatArray) -> FloatArray:
-            return np.asarray(np.einsum("pa,qb,rc->pqrabc", *parts).reshape(27, 27))
-
-        shape = product(value, value, value)
-        local = np.stack(
-            [
-                product(slope, value, value),
-                product(value, slope, value),
-                product(value, value, slope),
-            ],
-            axis=-1,
-        )
+        shape, local, weights = shape_functions(3)
         corners = self.nodes[self.elements]
         jacobian = np.einsum("qnk,enx->eqxk", local, corners)
         gradient = np.einsum("qnk,eqkx->eqnx", local, np.linalg.inv(jacobian))
-        weight = np.einsum("p,q,r->pqr", gauss, gauss, gauss).ravel()
-        self.weight = np.abs(np.linalg.det(jacobian)) * weight
+        self.weight = np.abs(np.linalg.det(jacobian)) * weights
         place = np.einsum("qn,enx->eqx", shape, corners) - corners.mean(axis=1)[:, None]
         self.linears = np.concatenate([np.ones((*place.shape[:2], 1)), 10 * place], axis=2)
         weighted = (self.linears * self.weight[..., None]).transpose(0, 2, 1)
@@ -193,7 +178,7 @@ class Body:
         self.hold = np.zeros(self.count)
         if not bonded:
             self.hold[3 * self.below] = np.bincount(
-                self.base.ravel(), self._base_shares(self.nodes).ravel(), len(self.nodes)
+                self.base.ravel(), self._base_mass(self.nodes).sum(axis=2).ravel(), len(self.nodes)
             )[self.below]
             self.hold /= self.hold.sum()
         return turns
@@ -479,19 +464,11 @@ class Body:
         )
         return out
 
-    def _base_shares(self, nodes: FloatArray) -> FloatArray:
-        """Return ∫ N dA for each node of the base facets."""
-        return np.asarray(self._base_mass(nodes).sum(axis=2))
-
     def _base_mass(self, nodes: FloatArray) -> FloatArray:
-        points, gauss = GAUSS
-        value, slope = quadratic(points)
-        shape = np.einsum("pa,qb->pqab", value, value).reshape(9, 9)
-        local = np.stack(
-            [np.einsum("pa,qb->pqab", slope, value), np.einsum("pa,qb->pqab", value, slope)], -1
-        ).reshape(9, 9, 2)
+        """Return the mass matrices ∫ N N dA (e, 9, 9) of the base facets."""
+        shape, local, weights = shape_functions(2)
         jacobian = np.einsum("qnk,enx->eqxk", local, nodes[self.base][..., :2])
-        area = np.abs(np.linalg.det(jacobian)) * np.outer(gauss, gauss).ravel()
+        area = np.abs(np.linalg.det(jacobian)) * weights
         return np.asarray(np.einsum("eq,qa,qb->eab", area, shape, shape))
 
 

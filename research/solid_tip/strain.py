@@ -13,16 +13,17 @@ presses on that mesh.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from scipy.interpolate import KroghInterpolator
 
 from research.solid_tip import fit
-from research.solid_tip.__main__ import differences
+from research.solid_tip.__main__ import NODES, differences
 from research.solid_tip.fit import SolidTip
 from research.solid_tip.green import RING_EDGES, FloatArray, Meridian
 from research.solid_tip.rubber import HARMONICS, strained
@@ -30,15 +31,16 @@ from research.solid_tip.rubber import HARMONICS, strained
 NU = fit.chebyshev_nodes(*fit.NU, 3)
 SINES = np.sin(fit.THETA_MAX) ** 2 * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2  # sin²θ
 AREAS = np.pi * np.diff(RING_EDGES**2)
-# Computed values of ν for each block and tilt. Each tilt is an index of `SINES`. At the largest
-# depth and tilt, the elements of lying rubber collapse, and the solution does not converge. The fit
-# therefore extrapolates there.
+# Computed tilts of each block, as indices of `SINES`. At the largest depth and tilt, the elements
+# of lying rubber collapse, and the solution does not converge. The fit therefore extrapolates
+# there.
 TILTS = {
-    "bonded": {1: NU[1:2], 2: NU[1:2], 4: NU[1:2]},
-    "lying": {1: NU[1:2], 2: NU[1:2]},
-    "bonded-sticking": {2: NU[1:2], 4: NU[1:2]},
-    "lying-sticking": {2: NU[1:2]},
+    "bonded": (1, 2, 4),
+    "lying": (1, 2),
+    "bonded-sticking": (2, 4),
+    "lying-sticking": (2,),
 }
+TOLERANCE = 3e-3  # tolerance of the modes
 IN_ROOT = 5  # number of terms in √(d/a) for the effect of strain, the first being d/a
 
 
@@ -65,34 +67,6 @@ FORCE_ERROR = 0.005
 PRESSURE_ERROR = {"bonded": 0.01, "lying": 0.004}
 
 
-class Change(NamedTuple):
-    """Effect of finite strain on presses at a single θ and ν, as a function of d."""
-
-    s: FloatArray
-    energy: FloatArray  # ratio to the linear energy, minus 1, shape (n,)
-    push: FloatArray
-    lever: FloatArray  # U/(N d) of the linear solution
-    shear: FloatArray  # shear divided by the normal force
-    base: FloatArray  # base pressure divided by the normal force, shape (n, H, R)
-
-
-def change(arrays: Mapping[str, FloatArray], theta: float) -> Change:
-    """Compare the linear and nonlinear presses from `rubber.strained`."""
-    d, push, shear, energy = (arrays[name] for name in ("d", "push", "shear", "energy"))
-    force = push * np.cos(theta) - shear * np.sin(theta)
-    found = arrays["base"][:, :, 0] @ AREAS
-    base = arrays["base"] * (force / found / push)[..., None, None]
-    ratio = shear / push
-    return Change(
-        np.sqrt(d[0]),
-        energy[1] / energy[0] - 1,
-        push[1] / push[0] - 1,
-        energy[0] / (push[0] * d[0]),
-        ratio[1] - ratio[0],
-        base[1] - base[0],
-    )
-
-
 def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the terms d/a T_i(s) at each s (n, i), and their derivatives with respect to d/a."""
     x = 2 * s / fit.S_MAX - 1
@@ -101,104 +75,89 @@ def in_root(s: FloatArray) -> tuple[FloatArray, FloatArray]:
     return s[:, None] ** 2 * value, value + s[:, None] * slope / 2
 
 
-def coefficients(each: Change, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit the coefficients of energy ratio (i,), T (i,) and base pressure (i, H, R).
+def coefficients(
+    arrays: Mapping[str, FloatArray], theta: float, step: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit the effect of finite strain on the presses from `rubber.strained` at a single θ and ν.
 
-    ``step`` is the cell width.
+    Returns the coefficients of the energy ratio (i,), of T/N (i,) and of the base pressure divided
+    by N (i, H, R). ``step`` is the cell width.
     """
-    value, slope = in_root(each.s)
-    scatter = 0.001 + 0.05 * (step / each.s) ** 2
-    left = np.concatenate([value, value + (each.lever * each.s**2)[:, None] * slope])
-    right = np.concatenate([each.energy, each.push])
+    d, push, shear, energy = (arrays[name] for name in ("d", "push", "shear", "energy"))
+    force = push * np.cos(theta) - shear * np.sin(theta)
+    found = arrays["base"][:, :, 0] @ AREAS
+    base = arrays["base"] * (force / found / push)[..., None, None]
+    ratio = shear / push
+    s = np.sqrt(d[0])
+    value, slope = in_root(s)
+    scatter = 0.001 + 0.05 * (step / s) ** 2
+    lever = energy[0] / (push[0] * d[0])
+    left = np.concatenate([value, value + (lever * s**2)[:, None] * slope])
+    right = np.concatenate([energy[1] / energy[0] - 1, push[1] / push[0] - 1])
     scatter = np.concatenate([scatter, 6 * scatter])
 
     def fitted(rows: FloatArray, values: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.lstsq(rows, values, rcond=None)[0], dtype=np.float64)
 
-    energy = fitted(left / scatter[:, None], right / scatter)
-    base = fitted(value, each.base.reshape(len(value), -1))
-    return energy, fitted(value, each.shear), base.reshape(-1, *each.base.shape[1:])
-
-
-def through(points: FloatArray, values: FloatArray) -> Callable[[float], FloatArray]:
-    """Return the polynomial that interpolates ``values`` (first axis) at ``points``."""
-
-    def at(point: float) -> FloatArray:
-        weights = [
-            np.prod([(point - other) / (one - other) for other in points if other != one])
-            for one in points
-        ]
-        return np.asarray(np.tensordot(weights, values, axes=1))
-
-    return at
+    more_base = base[1] - base[0]
+    return (
+        fitted(left / scatter[:, None], right / scatter),
+        fitted(value, ratio[1] - ratio[0]),
+        fitted(value, more_base.reshape(len(value), -1)).reshape(-1, *more_base.shape[1:]),
+    )
 
 
 class Strain:
     """Effect of finite strain in one block, for any d, θ and ν."""
 
-    def __init__(self, block: str, tilts: Mapping[int, FloatArray], folder: Path) -> None:
-        """Set up a block; ``tilts`` maps indices in `SINES` to the ν values of coarse presses."""
+    def __init__(self, block: str, tilts: Sequence[int], folder: Path) -> None:
+        """Set up a block; ``tilts`` are the indices in `SINES` of the coarse tilted presses."""
         fine, coarse = Meridian(16), Meridian(8, finer=2, widest=0.2)
 
         def of(name: str, poisson: float, mesh: Meridian, theta: float | None) -> Any:
             file = folder / f"{block}-{name}-{poisson:.5f}.npz"
             found = strained(block, poisson, theta, mesh, file)
-            return coefficients(
-                change(found, theta or 0.0), np.pi / 2 / (16 if mesh is fine else 8)
-            )
+            return coefficients(found, theta or 0.0, np.pi / 2 / (16 if mesh is fine else 8))
 
         upright = [of("fine", poisson, fine, None) for poisson in NU]
-        self.upright = [through(NU, np.array(each)) for each in zip(*upright, strict=True)]
-        self.sines = SINES[list(tilts)]
-        theta = np.arcsin(np.sqrt(self.sines))
-        energy, shear, base, first = [], [], [], []
-        for number, angle in zip(tilts, theta, strict=True):
-            points = tilts[number]
-            each = [of(f"tilt{number}", poisson, coarse, angle) for poisson in points]
-            same = [of("coarse", poisson, coarse, None) for poisson in points]
-            parts = [np.array(part) for part in zip(*each, strict=True)]
-            itself = [np.array(part) for part in zip(*same, strict=True)]
-            energy.append(through(points, parts[0] - itself[0]))
-            shear.append(through(points, parts[1] / (np.sin(angle) * np.cos(angle))))
-            powers = np.sin(angle) ** np.arange(HARMONICS)[:, None]
-            base.append(through(points, parts[2] / powers))
-            first.append(through(points, parts[2][:, :, 0] - itself[2][:, :, 0]))
-        self.energy, self.shear, self.base, self.first = energy, shear, base, first
-
-    def at(self, poisson: float) -> Callable[[float], tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return a function that computes the coefficients at one ν from sin²θ.
-
-        The coefficients describe the energy ratio, T/(N sin θ cos θ) and the base pressure.
-        """
-        energy, _, base = (each(poisson) for each in self.upright)
-        rises, shears, bases, firsts = (
-            np.array([of(poisson) for of in each])
-            for each in (self.energy, self.shear, self.base, self.first)
-        )
-        rise = through(np.append(0.0, self.sines), np.concatenate([[0 * rises[0]], rises]))
-        first = through(np.append(0.0, self.sines), np.concatenate([[0 * firsts[0]], firsts]))
-        shear, harmonics = through(self.sines, shears), through(self.sines, bases)
+        self.upright = [KroghInterpolator(NU, each) for each in zip(*upright, strict=True)]
+        sines = SINES[list(tilts)]
+        theta = np.arcsin(np.sqrt(sines))
+        tilted = [
+            of(f"tilt{k}", NU[1], coarse, angle) for k, angle in zip(tilts, theta, strict=True)
+        ]
+        energy, shear, base = (np.array(each) for each in zip(*tilted, strict=True))
+        same_energy, _, same_base = of("coarse", NU[1], coarse, None)
+        with_upright = np.append(0.0, sines)
+        rise, first = energy - same_energy, base[:, :, 0] - same_base[:, 0]
+        self.rise = KroghInterpolator(with_upright, [0 * rise[0], *rise])
+        self.first = KroghInterpolator(with_upright, [0 * first[0], *first])
+        self.shear = KroghInterpolator(sines, shear / (np.sin(theta) * np.cos(theta))[:, None])
+        base /= np.sin(theta)[:, None, None, None] ** np.arange(HARMONICS)[:, None]
+        self.harmonics = KroghInterpolator(sines, base)
         # At small tilts, the higher harmonics are very small. Division by sin^m θ would leave only
         # mesh errors.
-        least = len(self.sines) > 1
-        higher = through(self.sines[least:], bases[least:])
+        least = 1 if len(sines) > 1 else 0
+        self.higher = KroghInterpolator(sines[least:], base[least:])
 
-        def of(square: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-            powers = np.sqrt(square) ** np.arange(HARMONICS)[:, None]
-            found = harmonics(square) * powers
-            found[:, 2:] = (higher(square) * powers)[:, 2:]
-            found[:, 0] = base[:, 0] + first(square)
-            return energy + rise(square), shear(square), found
+    def at(self, poisson: float, square: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the coefficients of energy ratio, T/(N sin θ cos θ) and base pressure.
 
-        return of
+        ``square`` is sin²θ.
+        """
+        energy, _, base = (each(poisson) for each in self.upright)
+        powers = np.sqrt(square) ** np.arange(HARMONICS)[:, None]
+        found = self.harmonics(square) * powers
+        found[:, 2:] = (self.higher(square) * powers)[:, 2:]
+        found[:, 0] = base[:, 0] + self.first(square)
+        return energy + self.rise(square), self.shear(square), found
 
     def strain(self, tip: SolidTip) -> fit.Samples:
         """Return presses of the linear ``tip`` over the whole domain, with finite strain added."""
         rows = []
-        at = self.at(tip.poisson)
         for square in fit.chebyshev_nodes(0, np.sin(fit.THETA_MAX) ** 2, 9):
             theta = float(np.arcsin(np.sqrt(square)))
-            ratio, more_shear, more_base = at(square)
+            ratio, more_shear, more_base = self.at(tip.poisson, square)
             for s in fit.chebyshev_nodes(0, fit.S_MAX, 28)[2:]:
                 d = s**2
                 push, energy, base = tip.press(d, theta)
@@ -224,10 +183,8 @@ def main() -> None:
     parser.add_argument(
         "--folder", type=Path, required=True, help="folder for the results of presses"
     )
-    parser.add_argument("--tolerance", type=float, default=3e-3, help="tolerance of the modes")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    nodes = fit.chebyshev_nodes(*fit.NU, 4)
     with np.load(arguments.linear) as file:
         linear: dict[str, NDArray[Any]] = dict(file)
     arrays = {name: linear[name] for name in ("s_max", "theta_max", "nu_range")}
@@ -235,15 +192,15 @@ def main() -> None:
     rows = []
     for block, tilts in TILTS.items():
         strain = Strain(block, tilts, arguments.folder)
-        samples = [strain.strain(SolidTip(linear, block, poisson)) for poisson in nodes]
-        found = fit.fit(samples, nodes, 0.02, arguments.tolerance)
+        samples = [strain.strain(SolidTip(linear, block, poisson)) for poisson in NODES]
+        found = fit.fit(samples, NODES, 0.02, TOLERANCE)
         found["shear"] = np.pad(
             linear[f"{block}.shear"], ((0, AREAS.size - linear["ring_edges"].size + 1), (0, 0))
         )
         arrays |= {f"{block}.{name}": value for name, value in found.items()}
         arrays[f"{block}.force_error"] = np.array(FORCE_ERROR)
         arrays[f"{block}.pressure_error"] = np.array(PRESSURE_ERROR[block.partition("-")[0]])
-        for poisson, each in zip(nodes, samples, strict=True):
+        for poisson, each in zip(NODES, samples, strict=True):
             tip = SolidTip(arrays, block, poisson)
             rows.append(f"{block}, ν {poisson:.4f}: {differences(tip, each)}")
         print(block, len(found["m"]), "modes")

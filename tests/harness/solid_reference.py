@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from research.solid_tip.fit import SolidTip
+from research.solid_tip.fit import cell_means
 from research.solid_tip.green import RING_EDGES, Meridian
 from research.solid_tip.rubber import Body, Strained
 
@@ -28,18 +28,11 @@ UPRIGHT = Meridian(20, 6, 0.1)
 KEPT = (1, 2, 4, 6, 7)
 
 
-class _Rings(SolidTip):
-    edges = RING_EDGES
-
-    def __init__(self) -> None:
-        """Do not load the fitted data, because computing frames requires only the rings."""
-
-
 def row(block: str, theta: float, press: Strained) -> dict[str, object]:
     """Return one row of the data file, with lengths in tip radii and stresses in units of E."""
     force = press.push * np.cos(theta) - press.shear * np.sin(theta)
     pressure = press.base * (force / (press.base[0] @ AREAS))
-    frame = _Rings().frame(pressure, PITCH / RADIUS, CELLS)
+    frame = cell_means(pressure, PITCH / RADIUS, CELLS)
     known = {"base": block, "nu": POISSON, "d": press.d, "theta": theta, "push": press.push}
     return known | {"energy": press.energy, "force": force, "frame": frame.astype(np.float32)}
 

@@ -105,6 +105,7 @@ def test_relaxation_is_zero_for_a_tip_without_relaxation(live):
     said = (live / "relaxation").read_text()
     found = [float(each) for each in said.partition("[")[2].partition("]")[0].split(", ")]
     assert found == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
+    assert "written to" not in said
 
 
 def test_missing_loads_change_nothing(tmp_path, capsys, monkeypatch):

@@ -19,11 +19,8 @@ from softfinger.daemon.perception.calibration_file import (
 )
 from softfinger.daemon.perception.finger_model import make_estimator, make_models
 from softfinger.daemon.profile.load import load
-from softfinger.kinematics.calibration.measured_fit import (
-    CurvesError,
-    PressSums,
-    fit_measured,
-)
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.calibration.measured_fit import PressSums, fit_measured
 from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.kinematics.estimation.error_budget import Uncertainty
 from softfinger.kinematics.estimation.invalid import Invalid
@@ -70,11 +67,14 @@ def law() -> TipCurves:
     return fit_measured(presses(), A, GRID)
 
 
+def estimator_of(law: TipCurves, known: Uncertainty | None = None) -> MeasuredEstimator:
+    placed = replace(GRID, centre=law.centre, rotation=law.rotation)
+    return MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
+
+
 @pytest.mark.parametrize("push", [0.5, 2.0, 5.0])
 def test_an_undetected_contact_is_within_the_reported_uncertainty(law, push):
-    placed = replace(GRID, centre=law.centre, rotation=law.rotation)
-    known = Uncertainty(baseline=1e3)
-    estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
+    estimator = estimator_of(law, Uncertainty(baseline=1e3))
     d = (push / (WEIRD * A**0.2)) ** (1 / 1.8)
     found = estimator(weird(d, 0.0))
     assert found.valid
@@ -84,9 +84,8 @@ def test_an_undetected_contact_is_within_the_reported_uncertainty(law, push):
 @pytest.mark.parametrize("name", ["gain", "slope"])
 @pytest.mark.parametrize("d", [1.5e-3, 4e-3])
 def test_declared_cell_uncertainties_are_part_of_the_errors(law, name, d):
-    placed = replace(GRID, centre=law.centre, rotation=law.rotation)
     known = {"gain": Uncertainty(gain=0.12), "slope": Uncertainty(slope=500.0)}[name]
-    estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed, known=known)
+    estimator = estimator_of(law, known)
     off_by, theta = [], math.radians(10.0)
     x = GRID.pitches[0] * (np.arange(32) - 15.5)
     for sign in (-1.0, 1.0):
@@ -131,8 +130,7 @@ def test_the_curves_equal_those_of_the_tip(law):
 
 @pytest.mark.parametrize(("d", "degrees"), [(1e-3, 0.0), (2.5e-3, 14.0), (5.5e-3, -5.0)])
 def test_frames_are_estimated_with_consistent_errors(law, d, degrees):
-    placed = replace(GRID, centre=law.centre, rotation=law.rotation)
-    estimator = MeasuredEstimator(Fingertip(A, "measured", law=law), placed)
+    estimator = estimator_of(law)
     rng, squares = np.random.default_rng(2), []
     for _ in range(60):
         frame = weird(d, math.radians(degrees)) + NOISE * rng.standard_normal((32, 32))
@@ -153,14 +151,14 @@ def test_frames_are_estimated_with_consistent_errors(law, d, degrees):
 
 
 def test_unsuitable_contacts_are_refused():
-    with pytest.raises(CurvesError, match="found 5 presses at 5 depths, 0 of them tilted"):
+    with pytest.raises(CalibrationError, match="found 5 presses at 5 depths, 0 of them tilted"):
         fit_measured(presses(count=5), A, GRID)
     falls = presses()
     softer = [each / (1.0 + (d / 2e-3) ** 3) for each, d in zip(falls.frames, D, strict=True)]
-    with pytest.raises(CurvesError, match="the best-fitting smooth, increasing curves differ"):
+    with pytest.raises(CalibrationError, match="the best-fitting smooth, increasing curves differ"):
         fit_measured(replace(falls, frames=softer), A, GRID)
     single = replace(falls, frames=[each[:1] for each in falls.frames])
-    with pytest.raises(CurvesError, match="five frames for each press"):
+    with pytest.raises(CalibrationError, match="five frames for each press"):
         fit_measured(single, A, GRID)
 
 

@@ -75,14 +75,14 @@ def test_the_time_to_the_limit_matches_the_equations(square):
 def test_the_lasting_current_settles_at_the_limit():
     state = law(HeatState())
     follow(state.array, 0.0, 0.5, 30.0)
-    square = sustained_square(state.array, LIMIT)
+    square = sustained_square(state, LIMIT)
     solved = solve_ivp(
         lambda _, x: derivative(state, x, square), (0.0, 4e4), state.x, method="LSODA"
     )
     assert solved.y[1, -1] == pytest.approx(LIMIT, abs=0.1)
     assert time_to_limit(state.array, square, LIMIT + 1.0) == TIME_MAX
     state.x[2] = LIMIT + 5.0
-    assert sustained_square(state.array, LIMIT) == 0.0
+    assert sustained_square(state, LIMIT) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import softfinger.kinematics.contact as contact
-from research.solid_tip.fit import NU, SolidTip, rms_difference
+from research.solid_tip.fit import NU, SolidTip, cell_means, rms_difference
 from research.solid_tip.green import Meridian
 
 FILE = Path(contact.__file__).parent / "solid_tip.npz"
@@ -62,7 +62,7 @@ def test_forces_match_taylor_hood_elements(arrays, d, tilt, force, tolerance):
 def test_the_extent_hardly_depends_on_the_depth(arrays, d):
     tip = SolidTip(arrays, "bonded", 0.49)
     pressure = tip.press(d * MM, 0.0)[2]
-    _, _, sigma = centroid_and_extent(tip.frame(pressure, PITCH, CELLS), PITCH)
+    _, _, sigma = centroid_and_extent(cell_means(pressure, PITCH, CELLS), PITCH)
     assert sigma == pytest.approx(9.5 * MM, abs=0.1 * MM)
 
 
@@ -83,7 +83,7 @@ def test_frames_match_three_dimensional_elements(arrays):
         assert its_push == pytest.approx(push, rel=0.01)
         assert its_energy == pytest.approx(energy, rel=0.01)
         assert pressure[0] @ areas == pytest.approx(force, rel=0.01)
-        mine = tip.frame(pressure, PITCH, CELLS)
+        mine = cell_means(pressure, PITCH, CELLS)
         # The three-dimensional meshes are coarse, especially at the rim.
         assert rms_difference(mine[inner], frame[inner]) < (0.07 if theta else 0.015)
         moments = centroid_and_extent(mine, PITCH), centroid_and_extent(frame, PITCH)

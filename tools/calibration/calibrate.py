@@ -50,7 +50,7 @@ steps for a hand; FILE is a profile; if it does not exist, the --config profile 
   latency      frame latency; the running daemon grasps an object with several forces (--force sets
                the first force), or you give a recording of such a grip
 
-steps for a tip, in this order; each step adds its result to FILE:
+steps for a tip, in this order; each step except relaxation adds its result to FILE:
   tare         zero offset of each cell, noise, noise correlation, drift; the tip must be unloaded
   equilibrate  gain of each cell, and dead cells; requires several uniform pressures
   curve        pressure versus count; requires known weights placed upright on the tip (--force), or
@@ -162,22 +162,23 @@ def run(arguments: argparse.Namespace) -> int:
         told = calibrate_scales(arguments, settings)
     else:
         told = _calibrate_tip(arguments, settings)
-    print(f"{step}: {told}; written to {arguments.file}")
+    written = "" if step == "relaxation" else f"; written to {arguments.file}"
+    print(f"{step}: {told}{written}")
     return 0
 
 
 def _calibrate_profile(arguments: argparse.Namespace, settings: Settings) -> str:
-    if arguments.step == "friction":
-        from softfinger.tools.calibration.friction import calibrate_friction
-
-        return calibrate_friction(arguments, settings)
-    if arguments.step == "latency":
-        from softfinger.tools.calibration.latency import calibrate_latency
-
-        return calibrate_latency(arguments, settings)
+    from softfinger.tools.calibration.friction import calibrate_friction
     from softfinger.tools.calibration.joints import calibrate_heat, calibrate_joints
+    from softfinger.tools.calibration.latency import calibrate_latency
 
-    return (calibrate_heat if arguments.step == "heat" else calibrate_joints)(arguments, settings)
+    steps = {
+        "joints": calibrate_joints,
+        "heat": calibrate_heat,
+        "friction": calibrate_friction,
+        "latency": calibrate_latency,
+    }
+    return steps[arguments.step](arguments, settings)
 
 
 def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
@@ -197,7 +198,8 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
     else:
         loads = gather(arguments, settings, calibration)
         calibration, line, panels = done(Step(arguments, settings, calibration, loads))
-    save_calibration(file, calibration)
+    if arguments.step != "relaxation":  # Its result is only printed, for the profile.
+        save_calibration(file, calibration)
     if panels and not arguments.no_plot:
         try:
             draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))

@@ -130,8 +130,7 @@ def _live(
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
-            # Frames that were scanned earlier may still show the previous load.
-            frames = _fresh(backend, clock, clock.now())
+            frames = _fresh(backend, clock)
             loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
     return loads
 
@@ -145,7 +144,7 @@ def _while_pressed(
 ) -> NDArray[np.uint16]:
     """Return the last frames before a load is applied, and ``--frames`` frames under the load."""
     before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
-    frames = _fresh(backend, clock, clock.now())
+    frames = _fresh(backend, clock)
     with ThreadPoolExecutor(1) as pool:
         brought = pool.submit(bring, arguments, told, {"load": 1, **load})
         while not brought.done():
@@ -189,16 +188,18 @@ def _opened(settings: Settings, clock: RealClock, finger: str) -> Iterator[Tacti
     if backend is None:
         raise TactileError("tactile.backend: found none, expected a sensor")
     backend.open()
-    try:
+    with contextlib.closing(backend):
         yield backend
-    finally:
-        backend.close()
 
 
-def _fresh(backend: TactileSensor, clock: RealClock, since: float) -> Iterator[Frame]:
-    """Yield new frames that were scanned after ``since``. Raises TactileError."""
+def _fresh(backend: TactileSensor, clock: RealClock) -> Iterator[Frame]:
+    """Yield new frames. Raises TactileError.
+
+    Frames that were scanned before the first call are skipped, because they may still show the
+    previous load.
+    """
     last = backend.latest()
-    waited = clock.now()
+    since = waited = clock.now()
     while True:
         clock.sleep_until(clock.now() + 1e-3)
         frame = backend.latest()

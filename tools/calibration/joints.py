@@ -77,9 +77,9 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
             direction = 1 if closed > opened else -1
             low, high = (direction * (counts - zero) * radian for counts in (opened, closed))
             found = (servo, direction, zero, round(low + _MARGIN, 3), round(high - _MARGIN, 3))
-            keys = [(section, key) for section, values in new.items() for key in values]
-            for (section, key), value in zip(keys, found, strict=True):
-                new[section][key][finger] = value
+            lists = (each for values in new.values() for each in values.values())
+            for each, value in zip(lists, found, strict=True):
+                each[finger] = value
             old = servos.ids[finger]
             swapped = "" if servo == old else f" (servos.ids has {old}: the IDs are swapped)"
             told.append(

@@ -18,15 +18,13 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
-    CalibrationFileError,
     CentreStep,
     Converter,
     CurveStep,
     EquilibrateStep,
     ModulusStep,
     TareStep,
-    difference,
-    load_calibration,
+    calibration_of,
     now,
     sensor_of,
 )
@@ -45,7 +43,7 @@ from softfinger.kinematics.calibration.calibration import (
     tare,
     without_clipping,
 )
-from softfinger.kinematics.calibration.measured_fit import CurvesError, PressSums, fit_measured
+from softfinger.kinematics.calibration.measured_fit import PressSums, fit_measured
 from softfinger.kinematics.calibration.press_fit import (
     Presses,
     TipFit,
@@ -76,13 +74,7 @@ def begin(arguments: argparse.Namespace, settings: Settings) -> Calibration:
     sensor = sensor_of(settings, FINGERS.index(arguments.finger))
     if not arguments.file.exists():
         return Calibration(sensor=sensor, date=now())
-    calibration = load_calibration(arguments.file)
-    wrong = difference(calibration.sensor, sensor)
-    if wrong:
-        raise CalibrationFileError(
-            f"{arguments.file}: the calibration belongs to another sensor: {wrong}"
-        )
-    return calibration
+    return calibration_of(sensor, arguments.file)
 
 
 @dataclass(frozen=True)
@@ -100,9 +92,22 @@ class Step:
         return Converter(self.calibration, self.settings.tactile.pascal_per_count)
 
     @property
+    def d(self) -> FloatArray:
+        """Displacement at each load [m]. Raises CalibrationError if it is not known."""
+        if "d" not in self.loads.truths:
+            raise CalibrationError(f"{self.arguments.step}: expected --d, or a run that contains d")
+        return self.loads.truths["d"]
+
+    @property
     def theta(self) -> FloatArray:
         """Tilt at each load [rad]."""
         return self.loads.truths.get("theta", np.zeros(len(self.loads.frames)))
+
+    @cached_property
+    def saturated(self) -> NDArray[np.bool_]:
+        """Mask of the cells that saturated at each load, bool [loads, rows, cols]."""
+        full = self.calibration.sensor.full_count
+        return np.stack([(frames >= full).any(axis=0) for frames in self.loads.frames])
 
     @cached_property
     def over(self) -> list[FloatArray]:
@@ -216,8 +221,8 @@ def _curve(step: Step) -> Done:
             for x, theta in zip(d, step.theta, strict=True)
         ]
         force = np.array([each.sum() * step.cell_area for each in pressures])
-    for k, frames in enumerate(step.loads.frames):
-        if (frames >= sensor.full_count).any():
+    for k, saturated in enumerate(step.saturated):
+        if saturated.any():
             raise CalibrationError(
                 f"curve: load {k + 1} saturates a cell, so its force can't be used; reduce the load"
             )
@@ -255,13 +260,10 @@ def _centre(step: Step) -> Done:
 
 
 def _modulus(step: Step) -> Done:
-    d, theta, sensor = step.loads.truths.get("d"), step.theta, step.calibration.sensor
-    if d is None:
-        raise CalibrationError("modulus: expected --d, or a run that contains d")
+    d, theta = step.d, step.theta
     pressed = zip(step.pressures, step.readings, strict=True)
     force = np.array([each[reading > 0.0].sum() for each, reading in pressed]) * step.cell_area
-    full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
-    whole = ~full.any(axis=(1, 2))  # Saturated cells read less than their actual load.
+    whole = ~step.saturated.any(axis=(1, 2))  # Saturated cells read less than their actual load.
     tip = make_tip(step.settings)
     found = fit_modulus(d[whole], theta[whole], force[whole], tip=tip)
     line = (
@@ -282,18 +284,15 @@ def _modulus(step: Step) -> Done:
 
 
 def _law(step: Step) -> Done:
-    d, theta, settings = step.loads.truths.get("d"), step.theta, step.settings
-    if d is None:
-        raise CalibrationError("law: expected --d, or a run that contains d")
+    d, theta, settings = step.d, step.theta, step.settings
     if len(d) < 3 or np.ptp(d) <= 0.0:
         raise CalibrationError("law: expected at least three presses at different values of d")
-    sensor = step.calibration.sensor
-    grid = calibrated_grid(settings, FINGERS.index(sensor.finger), step.calibration)
-    full = np.stack([(each >= sensor.full_count).any(axis=0) for each in step.loads.frames])
+    finger = FINGERS.index(step.calibration.sensor.finger)
+    grid = calibrated_grid(settings, finger, step.calibration)
     noise = settings.tactile.noise / math.sqrt(min(map(len, step.loads.frames)))
     live = step.converter.live
     signed = np.stack([step.converter.pressure(each) for each in step.over])
-    presses = Presses(signed, d, theta, noise, live & ~full)
+    presses = Presses(signed, d, theta, noise, live & ~step.saturated)
     material = make_material(settings.material)
     fits = compare_tips(presses, settings.tip.radius, grid, live, material)
     best, lines = fits[0], [_told(each) for each in fits]
@@ -314,7 +313,7 @@ def _law(step: Step) -> Done:
         lines.append(_measured_told(steps["law"], left))
         if best.valid < 1.0 or (d_error < 0.5 * best.d_error and theta_error < best.theta_error):
             wants = {"physics": "measured"}
-    except CurvesError as error:
+    except CalibrationError as error:
         if best.valid == 0.0:
             raise CalibrationError(
                 f"law: no model fits these presses; best model: {lines[0]}; measured curves: "
@@ -350,15 +349,14 @@ def _measured(step: Step, pressures: FloatArray) -> tuple[TipCurves, FloatArray]
 
     Raises
     ------
-    CurvesError
+    CalibrationError
     """
-    d, theta, frames = step.loads.truths["d"], step.theta, step.loads.frames
-    sensor, converter, tare = step.calibration.sensor, step.converter, step.calibration.tare
-    if any((each >= sensor.full_count).any() for each in frames):
-        raise CurvesError(
+    d, theta, converter, tare = step.d, step.theta, step.converter, step.calibration.tare
+    if step.saturated.any():
+        raise CalibrationError(
             "a cell saturated during a press, so the press can't be used; reduce the load"
         )
-    seen = [converter(each) for each in frames]
+    seen = [converter(each) for each in step.loads.frames]
     rest = converter.pressure((tare.excess if tare else 0.0) * converter.gain)
     force, gain = pressures.sum(axis=(1, 2)) * step.cell_area, 1.0
     if (known := step.loads.truths.get("force")) is not None:
