@@ -112,6 +112,7 @@ class Joint:
     finger: int
     id: int
     scale: JointScale
+    firmware: int = 0
     bound: int = 0  # maximum goal current in counts
     ends: tuple[int, int] = (0, 0)  # position limits in counts
     q: float = 0.0  # angle in the last valid reading [rad]

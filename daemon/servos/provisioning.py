@@ -340,8 +340,8 @@ def _set_up(
         if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
             return failed("replies to a ping but not to a read")
         result.append(Finding("fixed", name, "status return level 0 → 2"))
-    table = line.read(servo_id, 0, CHECKED)
-    if table is None:
+    table = Registers.read(line, servo_id)
+    if not table:
         return failed("the registers could not be read")
     if table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
         return None
@@ -373,7 +373,7 @@ def _reboot_if_needed(
     """
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
-    table = Registers(line.read(servo_id, 0, CHECKED) or b"")
+    table = Registers.read(line, servo_id)
     if not table:
         return result.append(Finding("warn", name, "the registers could not be read"))
     misplaced = check_position(name, scale, table, settings.hand, finger)
