@@ -20,7 +20,6 @@ from softfinger.daemon.simulation.emulator.emulator import (
     DEFAULT_BOARD,
     Emulator,
     EmulatorClock,
-    EmulatorError,
     with_board,
 )
 from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, LinkFolder
@@ -122,7 +121,7 @@ def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues
 @pytest.mark.parametrize("name", ["servos", "control"])
 def test_other_files_in_place_of_links_or_the_control_socket_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("mine")
-    with pytest.raises(EmulatorError, match=f"{name}: .*exists"):
+    with pytest.raises(FolderError, match=f"{name}: .*exists"):
         Emulator(Settings(), tmp_path)
     assert (tmp_path / name).read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == [name]

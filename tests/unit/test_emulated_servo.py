@@ -378,7 +378,7 @@ def test_reboot_resets_ram_and_keeps_eeprom() -> None:
 )
 def test_unit_conversions_are_inverse(direction: int, zero: int, ratio: float, counts: int) -> None:
     servos = ServoSettings(direction=(direction, direction), zero=(zero, zero), gear_ratio=ratio)
-    scale = JointScale.of(servos, 1)
+    scale = JointScale.of(servos, 1, by_name(servos.model))
     assert scale.position_counts(scale.angle(counts)) == counts
     assert scale.velocity_counts(scale.rate(counts)) == counts
     assert scale.current_counts(scale.amperes(counts)) == counts

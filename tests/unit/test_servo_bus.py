@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model import framing
@@ -244,7 +245,7 @@ def test_directions_and_zero_offsets_of_the_settings() -> None:
     assert c.read(reg.PRESENT_POSITION, 4, 1) == 2048 + turn
     assert c.read(reg.PRESENT_POSITION, 4, 2) == 2048 - turn
     assert c.read(reg.OPERATING_MODE, 1, 2) == reg.CURRENT_BASED_POSITION_MODE
-    with pytest.raises(ValueError, match="does not support 4500000 baud"):
+    with pytest.raises(SettingsError, match="does not support 4500000 baud"):
         hand_bus(servos={"model": "XL330-M288"}, baud=4_500_000)
 
 

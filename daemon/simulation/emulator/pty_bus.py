@@ -37,19 +37,48 @@ PASSAGE_TIME = 15e-6
 _LAG_TIME = 0.0005
 
 
-def open_pty() -> tuple[int, int, str]:
-    """Open a pty and return its non-blocking master, its raw slave, and the path of the slave.
+class PtyPort:
+    """Pseudo-terminal at ``path``, which can be unplugged and plugged in again.
 
     The slave stays open in this process, so clients can connect and disconnect without errors.
     """
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    os.set_blocking(master, False)
-    return master, slave, os.ttyname(slave)
+
+    def __init__(self) -> None:
+        self.plug()
+
+    def fileno(self) -> int:
+        """Return the file descriptor to wait for, or -1 while the port is unplugged."""
+        return self._master
+
+    @property
+    def plugged(self) -> bool:
+        """True while the terminal exists."""
+        return self._master >= 0
+
+    def plug(self) -> None:
+        """Create or recreate the terminal at a new ``path``."""
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+
+    def unplug(self) -> None:
+        """Remove the terminal, which makes a client's reads fail, but keep the device running."""
+        if self.plugged:
+            os.close(self._master)
+            os.close(self._slave)
+        self._master = self._slave = -1
+
+    def apply_fault(self, kind: str, value: float, t: float) -> None:
+        """Begin a fault of the port or device; the kinds ``plug`` and ``well`` end faults."""
+        if kind == "unplug":
+            self.unplug()
+        elif kind in ("plug", WELL) and not self.plugged:
+            self.plug()
 
 
-class PtyServoBus:
-    """Servo bus on a new pseudo-terminal at ``path``.
+class PtyServoBus(PtyPort):
+    """Servo bus on a new pseudo-terminal.
 
     The caller must call :meth:`service` when :meth:`fileno` is readable, and at the time that
     :meth:`next_event` returns.
@@ -84,37 +113,18 @@ class PtyServoBus:
         self._free_at = -math.inf  # time at which the wire becomes free
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
-        self._arrives = -math.inf  # arrival time of the last reply
-        self.plug()
-
-    def fileno(self) -> int:
-        """Return the file descriptor to wait for, or -1 while the port is unplugged."""
-        return self._master
-
-    @property
-    def plugged(self) -> bool:
-        """True while the terminal exists."""
-        return self._master >= 0
-
-    def plug(self) -> None:
-        """Create or recreate the terminal at a new ``path``."""
-        self._master, self._slave, self.path = open_pty()
+        self.answering_until = -math.inf  # arrival time of the last reply without a fault's delay
+        super().__init__()
 
     def unplug(self) -> None:
         """Remove the terminal, as if an adapter were unplugged, but keep the servos running."""
         self._due.clear()
         self.bus.parser.reset()
-        if self.plugged:
-            os.close(self._master)
-            os.close(self._slave)
-        self._master = self._slave = -1
+        super().unplug()
 
     def apply_fault(self, kind: str, value: float, t: float) -> None:
         """Begin a fault of the port, line or servos; the kinds ``plug`` and ``well`` end faults."""
-        if kind == "unplug":
-            self.unplug()
-        elif kind in ("plug", WELL) and not self.plugged:
-            self.plug()
+        super().apply_fault(kind, value, t)
         if kind == WELL:
             self.bus.recover(t)
         else:
@@ -128,13 +138,8 @@ class PtyServoBus:
 
     def next_event(self) -> float:
         """Return the latest time [s] at which :meth:`service` must be called."""
-        servos = self.bus.next_event()
+        servos = self.bus.due
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
-
-    @property
-    def answering_until(self) -> float:
-        """Arrival time [s] of the last reply that was not delayed by a fault."""
-        return self._arrives
 
     def driven(self) -> bool:
         """Return True if torque is on and a process such as the daemon has locked the port."""
@@ -183,7 +188,7 @@ class PtyServoBus:
             due = free_at + reply.late
             self._queue(due - PASSAGE_TIME, reply.data)
             if not reply.late:
-                self._arrives = due
+                self.answering_until = due
         self._free_at = free_at
         return bool(replies)
 

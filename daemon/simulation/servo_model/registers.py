@@ -47,11 +47,6 @@ class Item:
     high: int = 0
     signed: bool = False
 
-    @property
-    def saved(self) -> bool:
-        """True for EEPROM registers."""
-        return self.address < reg.RAM
-
 
 def _read_only(address: int, size: int, default: int = 0, signed: bool = False) -> Item:
     return Item(address, size, default=default, signed=signed)
@@ -239,7 +234,7 @@ class ControlTable:
             if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:
                 return framing.DATA_RANGE
             return framing.OK if self._within_limit(address, value) else framing.DATA_LIMIT
-        if item.saved and memory[reg.TORQUE_ENABLE]:
+        if address < reg.RAM and memory[reg.TORQUE_ENABLE]:
             return framing.ACCESS
         if address == reg.OPERATING_MODE and value not in self._modes:
             return framing.DATA_RANGE

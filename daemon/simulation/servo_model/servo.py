@@ -155,7 +155,7 @@ class EmulatedServo:
     def heard(self, t: float) -> None:
         """Restart the bus watchdog because an instruction packet has arrived on the bus."""
         self._watched = t
-        self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
+        self.recorder.heard(t, self.torque_on)
 
     def next_event(self) -> float:
         """Return the time [s] at which :meth:`act` must be called next."""
@@ -193,9 +193,9 @@ class EmulatedServo:
         table = self.table
         if self.refuses or not table.holds(address, length):
             return None
-        if self.frozen:
-            return table.read(address, length)
-        if table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
+        if not self.frozen and table.reads(
+            address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE
+        ):
             self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
         return table.read(address, length)
 
@@ -206,15 +206,14 @@ class EmulatedServo:
         self.recorder.goals(values, self._joint, self.torque_on, error != framing.OK)
         if error:
             return error
-        limp = not self._memory[reg.TORQUE_ENABLE]
+        was_on = self.torque_on
         for item, value in plan:
             self.table.set(item.address, value)
         for item, value in plan:
             self._effect(item.address, value, t)
-        torque = self._memory[reg.TORQUE_ENABLE]
-        if torque and self._joint.moves_by_itself():
+        if self.torque_on and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP_TIME)
-        if limp and torque:
+        if self.torque_on and not was_on:
             goal = self.table.get(reg.GOAL_POSITION)
             self.recorder.torque_on(t, self._joint, self.mode, goal)
         self._joint.drive()
@@ -358,7 +357,7 @@ class EmulatedServo:
         """Start up after power-up or reboot."""
         table = self.table
         table.reset(first=reg.RAM)
-        self.health.restart()
+        self.health.overload = 0.0
         self._booted = self._watched = t
         self._joint.forget_turns()
         self._registered = None
