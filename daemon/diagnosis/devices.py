@@ -158,7 +158,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
     if not found.servos and not found.garbled:
         problem = f"no servo replies on {servos.port} at any baud rate"
         return [Finding("FAIL", "servos", problem, "check the power supply and the bus cable")]
-    what = plan(found, settings, model, model.baud_rates)
+    what = plan(found, settings, model)
     lines = [Finding("FAIL", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id

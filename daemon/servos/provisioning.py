@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_TIMEOUT
@@ -187,8 +187,8 @@ class Plan:
     strangers: tuple[FoundServo, ...]  # servos that reply but are not assigned to a finger
 
 
-def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Assign the found servos to the joints. ``rates`` are the baud rates to try.
+def plan(found: Found, settings: Settings, model: ServoModel) -> Plan:
+    """Assign the found servos to the joints.
 
     A servo that replies with the ID of a missing servo at another baud rate counts as the missing
     servo. If exactly one servo is missing and exactly one servo is unassigned, the unassigned servo
@@ -198,7 +198,7 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
     # An emulator that does not simulate line timing replies at every baud rate.
-    anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
+    anywhere = {each for each, count in seen.items() if 1 < count == len(model.baud_rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
     strangers = [
@@ -254,7 +254,7 @@ def provision(settings: Settings) -> list[Finding]:
         complete = all(line.ping(servo_id) is not None for servo_id in fingers)
     if not complete:
         found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
-        what = plan(found, settings, model, model.baud_rates)
+        what = plan(found, settings, model)
         for change in what.changes:
             result += _identify(servos.port, change, model)
         result += _unknown(settings, found, what)

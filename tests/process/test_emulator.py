@@ -28,8 +28,7 @@ from tests.conftest import until
 from tests.harness.emulated import HIL, EmulatorProcess, SdkServos, board, emulated, send
 from tests.harness.late_machine import LateMachine
 
-RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE = 9, 11, 64
-GOAL_CURRENT, GOAL_POSITION, PRESENT_POSITION = 102, 116, 132
+RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE, PRESENT_POSITION = 9, 11, 64, 132
 
 
 @pytest.fixture(scope="module")

@@ -298,7 +298,7 @@ class EmulatedServo:
             case "overheat":
                 self.health.heat.warm(self.table.get(reg.TEMPERATURE_LIMIT) + 5.0)
             case "overload":
-                self._fail(5)
+                self._fail(reg.OVERLOAD)
             case "undervoltage":
                 self.health.supply = (self.model.voltage_min - 10) * reg.VOLTAGE_UNIT
             case "stuck":

@@ -139,9 +139,8 @@ class ServoBus:
         for asked in framing.old_pings(data):
             replies += [
                 TimedReply(servo.return_delay, framing.old_status(servo.id))
-                for servo in self.servos
-                if servo.old_protocol and servo.awake(t) and asked in (servo.id, BROADCAST)
-                if not baud or baud == servo.baud
+                for servo in self._listening(t, baud, old_protocol=True)
+                if asked in (servo.id, BROADCAST)
             ]
         for packet in self.parser.feed(data, t):
             self.packets += 1
@@ -150,12 +149,9 @@ class ServoBus:
                 continue
             if not reads:
                 self.advance(t)
-            listening = []
-            for servo in self.servos:
-                heard = not servo.old_protocol and (not baud or baud == servo.baud)
-                if servo.awake(t) and heard:
-                    servo.heard(t)
-                    listening.append(servo)
+            listening = self._listening(t, baud)
+            for servo in listening:
+                servo.heard(t)
             replies += self._answers(packet, listening, t)
             if not reads:
                 self.due = min([servo.next_event() for servo in self.servos])
@@ -165,6 +161,14 @@ class ServoBus:
             TimedReply(reply.delay, spoilt, late)
             for reply in replies
             for late, spoilt in self.faults.spoil(reply.data)
+        ]
+
+    def _listening(self, t: float, baud: int, old_protocol: bool = False) -> list[EmulatedServo]:
+        """Return the servos that receive packets of a protocol at a baud rate."""
+        return [
+            servo
+            for servo in self.servos
+            if servo.old_protocol == old_protocol and servo.awake(t) and baud in (0, servo.baud)
         ]
 
     def fault(self, kind: str, value: float, t: float) -> None:

@@ -161,20 +161,17 @@ class ServoJoint:
 
     def drive(self) -> None:
         """Drive the plant according to the registers."""
-        memory, table, joint = self._memory, self._table, self._joint
-        mode = memory[reg.OPERATING_MODE]
+        memory, table, drive = self._memory, self._table, self._plant.drive
+        mode, goal = memory[reg.OPERATING_MODE], self.goal_angle(self.profile.position)
         if not memory[reg.TORQUE_ENABLE]:
-            self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
+            drive(self._joint, reg.CURRENT_MODE, False, 0.0, 0.0)
         elif mode == reg.CURRENT_BASED_POSITION_MODE:
             bound = abs(table.get(reg.GOAL_CURRENT)) * self._model.current_unit
-            goal = self.goal_angle(self.profile.position)
-            self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
+            drive(self._joint, mode, True, goal, bound)
         elif mode == reg.CURRENT_MODE:
-            current = self.goal_current(table.get(reg.GOAL_CURRENT))
-            self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, current)
+            drive(self._joint, mode, True, 0.0, self.goal_current(table.get(reg.GOAL_CURRENT)))
         else:
-            goal = self.goal_angle(self.profile.position)
-            self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
+            drive(self._joint, reg.POSITION_MODE, True, goal, self.current_limit)
 
     def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
         """Update registers 120 to 146 at the time ``seconds`` after power-up."""
