@@ -104,12 +104,8 @@ def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
     if mode in model.modes:
         return None
     problem = f"an {model.name} does not support {reg.MODE_NAMES[mode]} mode"
-    return Finding(
-        "FAIL",
-        name,
-        problem,
-        'use a model that measures its current, or set servos.mode = "position"',
-    )
+    fix = 'use a model that measures its current, or set servos.mode = "position"'
+    return Finding("FAIL", name, problem, fix)
 
 
 def check_servo(

@@ -14,7 +14,6 @@ import math
 import os
 import pty
 import struct
-import time
 import tty
 from collections.abc import Callable
 
@@ -90,19 +89,19 @@ class PtyServoBus(PtyPort):
     baud
         If 0, servos reply immediately at any rate. Otherwise, servos ignore clients that use
         another rate, and replies are delayed by their transmission time.
-    spin
-        Duration [s] of busy waiting before a paced reply is due, because sleeps end late.
     clock
         Clock for all times.
+    spin
+        Duration [s] of busy waiting before a paced reply is due, because sleeps end late.
     """
 
     def __init__(
         self,
         bus: ServoBus,
         *,
-        baud: int = 0,
+        baud: int,
+        clock: Callable[[], float],
         spin: float = 0.00012,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.bus = bus
         bus.parser.gap = _GAP_TIME
