@@ -138,13 +138,12 @@ class ControlTable:
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
-        self.items = _items_of(model, firmware)
+        self.at = {item.address: item for item in _items_of(model, firmware)}
         self.size = model.highest_address(firmware) + 1
         self.memory = bytearray(self.size)
-        self.at = {item.address: item for item in self.items}
         self._modes = model.modes
         self._unpack = {}
-        for item in self.items:
+        for item in self.at.values():
             form = _FORMATS[item.size]
             layout = struct.Struct(form.lower() if item.signed else form)
             self._unpack[item.address] = layout.unpack_from
@@ -173,7 +172,7 @@ class ControlTable:
 
         If ``first`` is `control_table.RAM`, the reset has the same effect as a power-up.
         """
-        for item in self.items:
+        for item in self.at.values():
             if item.address >= first and item.address not in keep:
                 self.set(item.address, item.default)
 

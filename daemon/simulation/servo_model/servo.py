@@ -159,17 +159,16 @@ class EmulatedServo:
 
     def next_event(self) -> float:
         """Return the time [s] at which :meth:`act` must be called next."""
-        due = min(self._next_step, self._next_sense)
         if self._boot_at > -math.inf:
-            return min(due, self._boot_at)
+            return self._boot_at
+        due = min(self._next_step, self._next_sense)
         return min(due, self._watched + self.watchdog) if self._armed else due
 
     def act(self, t: float) -> None:
         """Handle events due at time t; the plant must already have been advanced to t."""
+        if t < self._boot_at:
+            return
         if self._boot_at > -math.inf:
-            if t < self._boot_at:
-                self._next_sense = max(self._next_sense, self._boot_at)
-                return
             self._boot_at = -math.inf
             self._start(t)
         if self._armed and t >= self._watched + self.watchdog:
@@ -239,9 +238,7 @@ class EmulatedServo:
         """Switch torque off and restart after REBOOT_TIME with the default RAM values."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
-        self._next_step = math.inf
         self._boot_at = t + REBOOT_TIME
-        self._next_sense = self._boot_at
 
     def factory_reset(self, option: bytes, t: float) -> int:
         """Restore the factory defaults, then reboot.
@@ -335,7 +332,7 @@ class EmulatedServo:
 
     def _reset_mode(self) -> None:
         table = self.table
-        for item in table.items:
+        for item in table.at.values():
             if reg.VELOCITY_I_GAIN <= item.address <= reg.FEEDFORWARD_1ST_GAIN:
                 table.set(item.address, item.default)
         table.set(reg.PROFILE_ACCELERATION, 0)
