@@ -27,7 +27,6 @@ from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import (
     Examined,
     check_latency_timer,
-    check_registers,
     examine,
 )
 from softfinger.daemon.servos.control_table import ServoModel, by_name
@@ -68,7 +67,7 @@ def check_servos(settings: Settings) -> list[Finding]:
             _wait_for(line, settings)
             found = examine(line, settings, model)
             exchange = _try_exchange(line, settings, model, found)
-            silent = [each.id for each in found if not each.replies and not each.errors]
+            silent = [each.id for each in found if not each.replies]
             late = [servo_id for servo_id in silent if line.ping(servo_id) is not None]
         results = [
             line for each in found for line in _judge(each, settings, model, each.id in late)
@@ -127,8 +126,6 @@ def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -
     """Return one servo's findings; ``late`` is True if the servo replied after the timeout."""
     name = servo.name
     if not servo.replies:
-        if servo.errors:
-            return list(servo.errors)
         waited = settings.servos.open_timeout
         problem = (
             f"no reply at {settings.servos.baud} baud within servos.open_timeout = {waited:g} s"
@@ -137,13 +134,10 @@ def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -
         if late:
             fix = "set a longer servos.open_timeout, because the servo replies now"
         return [Finding("FAIL", name, problem, fix)]
-    results = [*servo.errors, *servo.notices]
-    if servo.table:
-        results += check_registers(name, model, servo.table, settings, servo.finger, "note")
-    if servo.table and not servo.errors:
-        described = Finding("pass", name, _described(servo, model))
-        results.append(servo.misplaced or described)
-    return results
+    if servo.errors:
+        return servo.findings
+    described = Finding("pass", name, _described(servo, model))
+    return [*servo.findings, servo.misplaced or described]
 
 
 def _described(servo: Examined, model: ServoModel) -> str:
@@ -164,7 +158,7 @@ def _search(settings: Settings, model: ServoModel) -> list[Finding]:
     if not found.servos and not found.garbled:
         problem = f"no servo replies on {servos.port} at any baud rate"
         return [Finding("FAIL", "servos", problem, "check the power supply and the bus cable")]
-    what = plan(found, settings, model, model.baud_rates)
+    what = plan(found, settings, model)
     lines = [Finding("FAIL", "servos", str(each), ONE_SERVO_ONLY) for each in found.garbled]
     for change in what.changes:
         same = change.servo.id == change.id

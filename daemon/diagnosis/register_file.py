@@ -16,7 +16,7 @@ from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
-from softfinger.daemon.servos.checks import CHECKED, Registers
+from softfinger.daemon.servos.checks import Registers
 from softfinger.daemon.servos.joint import servo_name
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
@@ -59,11 +59,11 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
     with open_line(settings.servos.port, settings.servos.baud) as line:
         for finger in map(FINGERS.index, settings.scene.fingers):
             servo_id = settings.servos.ids[finger]
-            table = line.read(servo_id, 0, CHECKED)
-            if table is None:
+            table = Registers.read(line, servo_id)
+            if not table:
                 found.append(Finding("FAIL", servo_name(servo_id, finger), "not saved: no reply"))
                 continue
-            number = Registers(table).word(reg.MODEL_NUMBER)
+            number = table.word(reg.MODEL_NUMBER)
             values = {each.name: each.value_in(table) for each in REGISTERS}
             firmware = table[reg.FIRMWARE_VERSION]
             servos.append(
@@ -119,8 +119,8 @@ def _restore(
     # Write the operating mode first, because this write resets gains, profiles and goals.
     order = sorted(REGISTERS, key=lambda each: each.address != reg.OPERATING_MODE)
     for turn in range(_PASS_COUNT + 1):
-        table = line.read(servo_id, 0, CHECKED)
-        if table is None:
+        table = Registers.read(line, servo_id)
+        if not table:
             result.append(Finding("warn", name, "not restored: the registers could not be read"))
             return
         tables.append(table)

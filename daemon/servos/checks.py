@@ -6,7 +6,8 @@ The checks read registers but do not change them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from softfinger.daemon.profile.settings import GeometrySettings, Settings
@@ -43,6 +44,11 @@ ANGLE_MARGIN = 0.25
 class Registers(bytes):
     """Registers of a servo, starting at address 0. The object is empty after a failed read."""
 
+    @classmethod
+    def read(cls, line: ServoLine, servo_id: int) -> Registers:
+        """Read the registers of a servo up to the present temperature."""
+        return cls(line.read(servo_id, 0, CHECKED) or b"")
+
     def word(self, address: int) -> int:
         """Return the unsigned 2-byte register at ``address``."""
         return int.from_bytes(self[address : address + 2], "little")
@@ -54,20 +60,24 @@ class Registers(bytes):
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """Result of checking one servo. A servo with ``errors`` is unusable."""
+    """Result of checking one servo."""
 
     finger: int
     id: int
-    replies: bool  # True if the servo responds to a ping
-    table: Registers = field(default_factory=Registers)
-    errors: tuple[Finding, ...] = ()
-    notices: tuple[Finding, ...] = ()
+    name: str  # in reports
+    table: Registers
+    findings: list[Finding]  # problems in order of severity
     misplaced: Finding | None = None  # finding that reports an implausible joint angle, or None
 
     @property
-    def name(self) -> str:
-        """Name in reports."""
-        return servo_name(self.id, self.finger)
+    def replies(self) -> bool:
+        """True if the servo responds to a ping; then it has registers or an error."""
+        return bool(self.table or self.findings)
+
+    @property
+    def errors(self) -> list[Finding]:
+        """Findings that make the servo unusable."""
+        return [each for each in self.findings if each.status == "FAIL"]
 
 
 def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Examined]:
@@ -75,26 +85,17 @@ def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Exam
     found = []
     for finger in map(FINGERS.index, settings.scene.fingers):
         servo_id = settings.servos.ids[finger]
-        name, misplaced = servo_name(servo_id, finger), None
-        if line.ping(servo_id) is None:
-            old = (Finding("FAIL", name, *OLD_PROTOCOL),) if line.ping_old(servo_id) else ()
-            found.append(Examined(finger, servo_id, False, errors=old))
-            continue
-        table = Registers(line.read(servo_id, 0, CHECKED) or b"")
+        name, table, misplaced = servo_name(servo_id, finger), Registers(), None
+        findings: list[Finding] = []
+        if line.ping(servo_id) is not None:
+            table = Registers.read(line, servo_id)
+            findings = check_servo(name, model, table, settings, finger)
+        elif line.ping_old(servo_id):
+            findings = [Finding("FAIL", name, *OLD_PROTOCOL)]
         if table:
             scale = JointScale.of(settings.servos, finger, model)
             misplaced = check_position(name, scale, table, settings.hand, finger)
-            errors = check_servo(name, model, table, settings, finger)
-            notices = notice_servo(name, model, table, settings, finger)
-        else:
-            why = (
-                "replies to a ping but not to a read: the status return level is 0, two servos "
-                "have this ID, or the line is faulty"
-            )
-            errors, notices = [Finding("FAIL", name, why, FIX)], []
-        found.append(
-            Examined(finger, servo_id, True, table, tuple(errors), tuple(notices), misplaced)
-        )
+        found.append(Examined(finger, servo_id, name, table, findings, misplaced))
     return found
 
 
@@ -103,72 +104,45 @@ def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
     if mode in model.modes:
         return None
     problem = f"an {model.name} does not support {reg.MODE_NAMES[mode]} mode"
-    return Finding(
-        "FAIL",
-        name,
-        problem,
-        'use a model that measures its current, or set servos.mode = "position"',
-    )
+    fix = 'use a model that measures its current, or set servos.mode = "position"'
+    return Finding("FAIL", name, problem, fix)
 
 
 def check_servo(
     name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
 ) -> list[Finding]:
-    """Return the findings that prevent the use of a servo.
+    """Return the problems of a servo that replies, in order of severity.
 
     Parameters
     ----------
     name : name of the servo in reports
     model : model named in the settings
-    table : registers, up to at least the present temperature
+    table : registers of the servo
     settings : required configuration
     finger : 0 left, 1 right
     """
-    found: list[Finding] = []
-
-    def wrong(problem: str, fix: str = FIX) -> None:
-        found.append(Finding("FAIL", name, problem, fix))
-
+    if not table:
+        why = (
+            "replies to a ping but not to a read: the status return level is 0, two servos have "
+            "this ID, or the line is faulty"
+        )
+        return [Finding("FAIL", name, why, FIX)]
     number = table.word(reg.MODEL_NUMBER)
     if number != model.number:
-        wrong(*other_model(number, model))
-        return found
-    unfit = check_model(name, model, reg.MODE_NUMBERS[settings.servos.mode])
-    if unfit is not None:
-        found.append(unfit)
-    found += check_registers(name, model, table, settings, finger, "FAIL")
-    status = table[reg.HARDWARE_ERROR_STATUS]
-    if status:
-        wrong(f"hardware error: {reg.hardware_error_names(status)}", REBOOT_FIX)
-    volts, low, high = (
-        table.word(at) * reg.VOLTAGE_UNIT
-        for at in (reg.PRESENT_INPUT_VOLTAGE, reg.MIN_VOLTAGE_LIMIT, reg.MAX_VOLTAGE_LIMIT)
-    )
-    if not low <= volts <= high:
-        fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
-        # If the supply voltage suits the model, the limits stored in the servo are too narrow.
-        fix = FIX if fits else "check the power supply"
-        wrong(f"supply voltage is {volts:.1f} V, expected {low:.1f} to {high:.1f} V", fix)
-    firmware = table[reg.FIRMWARE_VERSION]
-    if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
-        wrong(
-            f"firmware {firmware} does not support the bus watchdog",
-            f"update the firmware to version {_WATCHDOG_FIRMWARE} or later, or set "
-            "servos.watchdog = 0",
-        )
-    current_max, greatest = settings.safety.current_max, model.stall_current
-    if model.senses_current and settings.servos.mode != "position" and greatest < current_max:
-        wrong(
-            f"safety.current_max is {current_max:g} A, above this model's stall current of "
-            f"{greatest:.3g} A",
-            "lower safety.current_max",
-        )
-    return found
+        return [Finding("FAIL", name, *other_model(number, model))]
+    found = [
+        *_check_registers(name, model, table, settings, finger),
+        *_check_state(name, model, table, settings),
+        *_notice_servo(name, model, table, settings),
+        *notice_strength(name, model, settings),
+    ]
+    severity: tuple[Status, ...] = ("FAIL", "warn", "note")
+    return sorted(found, key=lambda each: severity.index(each.status))
 
 
 def other_model(number: int, model: ServoModel) -> tuple[str, str]:
     """Return the problem and the fix for a servo whose model differs from the settings."""
-    if reg.by_number(number) is not None:
+    if number in (each.number for each in reg.MODELS.values()):
         return f"is an {reg.name_of(number)}, expected an {model.name}", "set servos.model"
     known = ", ".join(reg.MODELS)
     return (
@@ -177,31 +151,59 @@ def other_model(number: int, model: ServoModel) -> tuple[str, str]:
     )
 
 
-def check_registers(
-    name: str,
-    model: ServoModel,
-    table: Registers,
-    settings: Settings,
-    finger: int,
-    status: Status,
-) -> list[Finding]:
-    """Return the findings with this ``status`` for registers that contain wrong values."""
-    found = []
+def _check_registers(
+    name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
+) -> Iterator[Finding]:
+    """Yield a finding for each register that contains a wrong value."""
     for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
         wrong = row.wrong_in(table)
-        if wrong is not None and row.status == status:
-            fix = f"{FIX}, then {row.then}" if row.then else "" if row.armed else FIX
-            found.append(Finding(row.status, name, row.told(wrong), fix))
-    return found
+        if wrong is not None:
+            fix = f"{FIX}, then {row.then}" if row.then else "" if row.status == "note" else FIX
+            yield Finding(row.status, name, row.told(wrong), fix)
 
 
-def notice_servo(
-    name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
+def _check_state(
+    name: str, model: ServoModel, table: Registers, settings: Settings
+) -> Iterator[Finding]:
+    """Yield the findings, apart from register values, that prevent the use of a servo."""
+    unfit = check_model(name, model, reg.MODE_NUMBERS[settings.servos.mode])
+    if unfit is not None:
+        yield unfit
+    if status := table[reg.HARDWARE_ERROR_STATUS]:
+        error = reg.hardware_error_names(status)
+        yield Finding("FAIL", name, f"hardware error: {error}", REBOOT_FIX)
+    volts, low, high = (
+        table.word(at) * reg.VOLTAGE_UNIT
+        for at in (reg.PRESENT_INPUT_VOLTAGE, reg.MIN_VOLTAGE_LIMIT, reg.MAX_VOLTAGE_LIMIT)
+    )
+    if not low <= volts <= high:
+        fits = model.voltage_min <= table.word(reg.PRESENT_INPUT_VOLTAGE) <= model.voltage_max
+        # If the supply voltage suits the model, the limits stored in the servo are too narrow.
+        fix = FIX if fits else "check the power supply"
+        problem = f"supply voltage is {volts:.1f} V, expected {low:.1f} to {high:.1f} V"
+        yield Finding("FAIL", name, problem, fix)
+    firmware = table[reg.FIRMWARE_VERSION]
+    if settings.servos.watchdog > 0.0 and not model.is_x330 and firmware < _WATCHDOG_FIRMWARE:
+        problem = f"firmware {firmware} does not support the bus watchdog"
+        fix = (
+            f"update the firmware to version {_WATCHDOG_FIRMWARE} or later, or set "
+            "servos.watchdog = 0"
+        )
+        yield Finding("FAIL", name, problem, fix)
+    current_max, greatest = settings.safety.current_max, model.stall_current
+    if model.senses_current and settings.servos.mode != "position" and greatest < current_max:
+        problem = (
+            f"safety.current_max is {current_max:g} A, above this model's stall current of "
+            f"{greatest:.3g} A"
+        )
+        yield Finding("FAIL", name, problem, "lower safety.current_max")
+
+
+def _notice_servo(
+    name: str, model: ServoModel, table: Registers, settings: Settings
 ) -> list[Finding]:
     """Return notices about a usable servo."""
     servos, firmware = settings.servos, table[reg.FIRMWARE_VERSION]
-    if table.word(reg.MODEL_NUMBER) != model.number:
-        return []
     limit, present = table[reg.TEMPERATURE_LIMIT], table[reg.PRESENT_TEMPERATURE]
     notices = (
         (
@@ -233,9 +235,7 @@ def notice_servo(
         ),
         (present >= limit - _TEMPERATURE_MARGIN, f"{present} °C, close to its limit of {limit} °C"),
     )
-    found = [Finding("warn", name, text) for true, text in notices if true]
-    found += check_registers(name, model, table, settings, finger, "warn")
-    return found + notice_strength(name, model, settings)
+    return [Finding("warn", name, text) for true, text in notices if true]
 
 
 def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Finding]:

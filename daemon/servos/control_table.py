@@ -319,13 +319,8 @@ def by_name(name: str) -> ServoModel:
 
 def name_of(number: int) -> str:
     """Return the name of the model with this ``number``, or the number itself if it is unknown."""
-    names = [model.name for model in MODELS.values() if model.number == number]
-    return names[0] if names else f"model number {number}"
-
-
-def by_number(number: int) -> ServoModel | None:
-    """Return the model with this ``number``, or None if it is unknown."""
-    return next((model for model in MODELS.values() if model.number == number), None)
+    names = (model.name for model in MODELS.values() if model.number == number)
+    return next(names, f"model number {number}")
 
 
 def _crc_of(byte: int) -> int:

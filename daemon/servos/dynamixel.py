@@ -78,10 +78,9 @@ class DynamixelServos:
         self._mode = reg.MODE_NUMBERS[settings.servos.mode]
         self._handler = PacketHandler()
         self._joints: list[Joint] = []
-        self._line: ServoLine | None = None
-        self._torque: Torque | None = None
+        self._port: SerialPort | None = None  # open port
+        self._torque: Torque | None = None  # None until the servos on the port have been checked
         self._reads: TickReads | None = None
-        self._waiting: SerialPort | None = None  # open port whose servos have not responded yet
         self._turn = 0  # index of the most recently used span length
         self._varied_reads = 0  # remaining number of requests with varying span lengths
         self._next_health = self._next_check = -math.inf  # clock times of the next reads
@@ -102,8 +101,8 @@ class DynamixelServos:
             If the only problem is that servos do not respond. The port stays open for the next
             call, because reopening may restart an adapter that is still booting.
         """
-        waiting, self._waiting = self._waiting, None
-        self.close()
+        if self._torque is not None:
+            self.close()
         servos, profile = self._settings, self._profile
         model = by_name(servos.model)
         stored = max(2, round(_RECENT_TIME * profile.loop.rate))
@@ -111,72 +110,69 @@ class DynamixelServos:
             Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=stored))
             for f in map(FINGERS.index, profile.scene.fingers)
         ]
-        if waiting is None:
+        if self._port is None:
             patience = _BUSY_TIME if self._clock.pauses_when_late else 0.0
             port = SerialPort(servos.port, servos.baud, max(servos.reply_timeout, patience))
             port.openPort()
-        else:
-            port = waiting
-        line = ServoLine(port, self._handler)
-        torque = Torque(line, model, servos, profile.hand, self._joints)
+            self._port = port
+        line = ServoLine(self._port, self._handler)
         try:
             self._reads = self._check(line, model)
         except ServosSilent:
-            self._waiting = port
-            raise
+            raise  # The port stays open.
         except BaseException:
-            port.closePort()
+            self.close()
             raise
         more = len(self._joints) * (PRESENT[0] - CHECK[0]) * BITS_PER_BYTE / servos.baud
         self._check_interval = max(_CHECK_INTERVAL, more / _CHECK_FRACTION)
         self._varied_reads = 0
         self._next_health = self._next_check = -math.inf
-        self._line, self._torque = line, torque
+        self._torque = Torque(line, model, servos, profile.hand, self._joints)
 
     def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
         """Check the servos, the adapter and the group reads, and store joint limits and notices."""
         port = line.port
         allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _CHECK_TIMEOUT)
         try:
-            found = examine(line, self._profile, model)
-            self._judge(found, port, allowed)
-            claims = all(model.fast_read(each.table[reg.FIRMWARE_VERSION]) for each in found)
+            notices = self._judge(examine(line, self._profile, model), port, allowed)
+            claims = all(model.fast_read(joint.firmware) for joint in self._joints)
             ids = [joint.id for joint in self._joints]
-            reads, note = choose_reads(port, self._handler, ids, claims)
-            note += note_slow_replies(port, reads, self._profile)
+            reads, more = choose_reads(port, self._handler, ids, claims)
+            more += note_slow_replies(port, reads, self._profile)
         finally:
             port.reply_timeout = allowed
-        self.notices += tuple(note)
+        self.notices = (*notices, *more)
         for notice in self.notices:
             _log.warning(notice)
         return reads
 
-    def _judge(self, found: list[Examined], port: SerialPort, allowed: float) -> None:
-        """Set the joint limits and the notices from the results in ``found``.
+    def _judge(self, found: list[Examined], port: SerialPort, allowed: float) -> list[Finding]:
+        """Set the joint limits from the results in ``found``, and return the notices.
 
         ``allowed`` is the maximum reply time [s]. Raises ServoError, which lists all problems.
         """
-        if not any(each.replies or each.errors for each in found):
+        if not any(each.replies for each in found):
             raise ServosSilent(
                 f"{port.port_name}: no servo replies at {port.baudrate} baud (IDs "
                 f"{', '.join(str(each.id) for each in found)}): check the power supply and the "
                 "wiring; `softfinger doctor` tries every baud rate"
             )
         slow = check_latency_timer(port.port_name, allowed)
-        errors = [slow] if slow and slow.status == "FAIL" else []
-        notices = [slow] if slow and slow.status == "warn" else []
+        findings = [slow] if slow else []
         for each in found:
-            errors += each.errors
-            notices += each.notices
-            if not each.replies and not each.errors:
+            findings += each.findings
+            if not each.replies:
+                problem = f"no reply at {port.baudrate} baud"
                 fix = "check the cable and the ID; `softfinger doctor` tries every baud rate"
-                errors.append(Finding("FAIL", each.name, f"no reply at {port.baudrate} baud", fix))
-        if errors:
-            silent = sum(not each.replies and not each.errors for each in found)
+                findings.append(Finding("FAIL", each.name, problem, fix))
+        if errors := [each for each in findings if each.status == "FAIL"]:
+            silent = sum(not each.replies for each in found)
             kind = ServosSilent if len(errors) == silent else ServoError
             raise kind("\n".join(map(str, errors)))
+        notices = [each for each in findings if each.status == "warn"]
         for joint, each in zip(self._joints, found, strict=True):
             limit = self._settings.current_limit[joint.finger]
+            joint.firmware = each.table[reg.FIRMWARE_VERSION]
             joint.bound = min(each.table.word(reg.CURRENT_LIMIT), joint.scale.bound_counts(limit))
             joint.ends = (
                 each.table.long(reg.MIN_POSITION_LIMIT),
@@ -185,7 +181,7 @@ class DynamixelServos:
             if each.misplaced is not None:
                 fix = f"{each.misplaced.fix}; until then, `arm` is rejected"
                 notices.append(replace(each.misplaced, fix=fix))
-        self.notices = tuple(notices)
+        return notices
 
     # --- the tick --------------------------------------------------------------------------------
 
@@ -354,19 +350,13 @@ class DynamixelServos:
 
         If another program switched torque on, the torque stays on.
         """
-        if self._waiting is not None:
-            with contextlib.suppress(Exception):
-                self._waiting.closePort()
-            self._waiting = None
-        line, torque, reading = self._line, self._torque, Reading()
-        if line is None or torque is None:
-            return
+        torque, reading = self._torque, Reading()
         try:
             for _ in range(_CLOSING_TRY_COUNT):
-                if not torque.may_be_on:
+                if torque is None or not torque.may_be_on:
                     break
                 self.torque_off(reading)
-            if torque.may_be_on:
+            if torque is not None and torque.may_be_on:
                 _log.error(
                     "servos: torque off was not confirmed; the bus watchdogs will stop the servos"
                 )
@@ -377,6 +367,8 @@ class DynamixelServos:
             )
         except Exception as error:
             _log.error("servos: torque off was not confirmed: %s", error)
-        self._line = self._torque = self._reads = None
-        with contextlib.suppress(Exception):
-            line.port.closePort()
+        port, self._port = self._port, None
+        self._torque = self._reads = None
+        if port is not None:
+            with contextlib.suppress(Exception):
+                port.closePort()

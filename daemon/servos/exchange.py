@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 from dynamixel_sdk.robotis_def import COMM_SUCCESS
 
 from softfinger.daemon.errors import ServoError
@@ -50,7 +51,6 @@ class TickReads:
         ids: Sequence[int],
         kind: type[GroupRead],
     ) -> None:
-        self.fast = kind is FastGroupRead
         self.spans = {
             (first, last): [
                 kind(port, handler, first - more, last + 1 - first + more, ids)
@@ -116,26 +116,20 @@ def time_exchanges(
     reads are timed. The reply timeout is at least 0.1 s.
     """
     allowed, port.reply_timeout = port.reply_timeout, max(port.reply_timeout, _TIMED_REPLY_TIMEOUT)
-    group, durations, failed = reads.spans[PRESENT][0], [], 0
+    group, durations = reads.spans[PRESENT][0], []
     try:
         for _ in range(count):
             began = time.monotonic()
             if group.exchange() == COMM_SUCCESS:
                 durations.append(time.monotonic() - began)
-            else:
-                failed += 1
             if write is not None:
                 write()
     finally:
         port.reply_timeout = allowed
-    durations.sort()
     if not durations:
         return ExchangeTimes(math.inf, math.inf, math.inf, 1.0)
-    at = 0.99 * (len(durations) - 1)
-    low = durations[int(at)]
-    high = durations[min(int(at) + 1, len(durations) - 1)]
-    p99 = low + (at - int(at)) * (high - low)
-    return ExchangeTimes(durations[0], durations[len(durations) // 2], p99, failed / count)
+    p50, p99 = np.percentile(durations, (50, 99)).tolist()
+    return ExchangeTimes(min(durations), p50, p99, (count - len(durations)) / count)
 
 
 def judge_exchanges(

@@ -10,7 +10,7 @@ from typing import Final
 
 from softfinger.daemon.profile.settings import ServoSettings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.control_table import ServoModel, by_name
+from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.types import FINGERS
 
 _GOAL_LIMIT = 1_048_575  # maximum goal in multi-turn modes [counts]
@@ -58,15 +58,8 @@ class JointScale:
     current_unit: float  # A per current count
 
     @classmethod
-    def of(cls, servos: ServoSettings, joint: int, model: ServoModel | None = None) -> JointScale:
-        """Return the scale of joint 0 (left) or 1 (right) from the settings.
-
-        Raises
-        ------
-        KeyError
-            If the servo model in the settings is unknown.
-        """
-        model = by_name(servos.model) if model is None else model
+    def of(cls, servos: ServoSettings, joint: int, model: ServoModel) -> JointScale:
+        """Return the scale of joint 0 (left) or 1 (right) from the settings."""
         return cls(
             direction=servos.direction[joint],
             zero=servos.zero[joint],
@@ -112,6 +105,7 @@ class Joint:
     finger: int
     id: int
     scale: JointScale
+    firmware: int = 0
     bound: int = 0  # maximum goal current in counts
     ends: tuple[int, int] = (0, 0)  # position limits in counts
     q: float = 0.0  # angle in the last valid reading [rad]

@@ -68,7 +68,6 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             self.ser = serial.Serial(path, self.baudrate, timeout=0, exclusive=True)
         except (serial.SerialException, OSError, ValueError, termios.error) as error:
             raise ServoError(_why_not(path, error)) from None
-        self.is_open = True
         self._descriptor = self.ser.fileno()
         try:
             if self._low_latency:
@@ -83,7 +82,6 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         """Close the port if it is open."""
         if self.ser is not None:
             self.ser.close()
-        self.is_open = False
         self._descriptor = -1
 
     def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:

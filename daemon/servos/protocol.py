@@ -30,11 +30,9 @@ from typing import Any
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from dynamixel_sdk.robotis_def import (
     BROADCAST_ID,
-    COMM_NOT_AVAILABLE,
     COMM_RX_CORRUPT,
     COMM_RX_TIMEOUT,
     COMM_SUCCESS,
-    COMM_TX_ERROR,
     COMM_TX_FAIL,
     INST_PING,
     INST_READ,
@@ -88,8 +86,6 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
         """Add byte stuffing and CRC to the packet ``txpacket`` and send it."""
         packet = packed(txpacket[4], txpacket[7], bytes(txpacket[8:-2]))
-        if len(packet) > _MAX_PACKET:
-            return int(COMM_TX_ERROR)
         return int(COMM_SUCCESS if port.send(packet, _STATUS_SIZE) else COMM_TX_FAIL)
 
     def readTxRx(
@@ -101,8 +97,6 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         an earlier action instruction and is skipped. The SDK does not wait for replies to action
         instructions.
         """
-        if dxl_id >= BROADCAST_ID:
-            return [], int(COMM_NOT_AVAILABLE), 0
         request = packed(dxl_id, INST_READ, struct.pack("<HH", address, length))
         if not port.send(request, _STATUS_SIZE + length):
             return [], int(COMM_TX_FAIL), 0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_TIMEOUT
@@ -39,6 +39,8 @@ ONE_SERVO_ONLY = (
     "connect only one servo and run `softfinger doctor --fix`; then connect the next servo as "
     "well, and run the command again"
 )
+_TORQUE_OFF = "torque switched off, because the EEPROM is locked while torque is on"
+_TORQUE_STAYS_ON = "torque could not be switched off"
 _READ_COUNT = 8  # number of full-table reads
 _REBOOT_TIMEOUT = 2.0  # maximum time from a reboot until the servo responds [s]
 _WRITE_TIME = 0.05  # time for sending a packet and storing its data in the EEPROM [s]
@@ -185,8 +187,8 @@ class Plan:
     strangers: tuple[FoundServo, ...]  # servos that reply but are not assigned to a finger
 
 
-def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[int]) -> Plan:
-    """Assign the found servos to the joints. ``rates`` are the baud rates to try.
+def plan(found: Found, settings: Settings, model: ServoModel) -> Plan:
+    """Assign the found servos to the joints.
 
     A servo that replies with the ID of a missing servo at another baud rate counts as the missing
     servo. If exactly one servo is missing and exactly one servo is unassigned, the unassigned servo
@@ -196,7 +198,7 @@ def plan(found: Found, settings: Settings, model: ServoModel, rates: Sequence[in
     ids = {servos.ids[FINGERS.index(name)]: FINGERS.index(name) for name in settings.scene.fingers}
     seen = Counter(each.id for each in found.servos)
     # An emulator that does not simulate line timing replies at every baud rate.
-    anywhere = {servo_id for servo_id, count in seen.items() if 1 < count == len(rates)}
+    anywhere = {each for each, count in seen.items() if 1 < count == len(model.baud_rates)}
     home = {each.id for each in found.servos if each.baud == servos.baud and each.id in ids}
     bad = {(each.id, each.baud) for each in found.garbled}
     strangers = [
@@ -252,9 +254,9 @@ def provision(settings: Settings) -> list[Finding]:
         complete = all(line.ping(servo_id) is not None for servo_id in fingers)
     if not complete:
         found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
-        what = plan(found, settings, model, model.baud_rates)
+        what = plan(found, settings, model)
         for change in what.changes:
-            _identify(servos.port, change, model, result)
+            result += _identify(servos.port, change, model)
         result += _unknown(settings, found, what)
     with open_line(servos.port, servos.baud) as line:
         for servo_id, finger in fingers.items():
@@ -267,7 +269,7 @@ def provision(settings: Settings) -> list[Finding]:
             elif is_garbled(line, servo_id):
                 result.append(Finding("warn", name, "the replies are corrupted", ONE_SERVO_ONLY))
             else:
-                _set_up(line, settings, finger, model, result)
+                result += _set_up(line, settings, finger, model)
     return result
 
 
@@ -287,12 +289,13 @@ def _unknown(settings: Settings, found: Found, what: Plan) -> list[Finding]:
     ]
 
 
-def _identify(path: str, change: Change, model: ServoModel, result: list[Finding]) -> None:
+def _identify(path: str, change: Change, model: ServoModel) -> list[Finding]:
     """Set the ID and baud rate of a servo."""
     old, new, name = change.servo.id, change.id, change.name
+    found: list[Finding] = []
 
-    def failed(problem: str, fix: str = "") -> None:
-        result.append(Finding("warn", name, problem, fix))
+    def failed(problem: str, fix: str = "") -> list[Finding]:
+        return [*found, Finding("warn", name, problem, fix)]
 
     if change.baud not in model.baud_rates:
         return failed(f"an {model.name} does not support {change.baud} baud", "set servos.baud")
@@ -301,10 +304,10 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
             return failed("replies to a ping but not to a read")
         if new != old and line.ping(new) is not None:
             return failed(f"ID {new} at {change.servo.baud} baud is used by another servo")
-        if line.read(old, reg.TORQUE_ENABLE, 1) != b"\x00" and not _torque_off(
-            line, old, name, result
-        ):
-            return None
+        if line.read(old, reg.TORQUE_ENABLE, 1) != b"\x00":
+            if line.store(reg.TORQUE_ENABLE, {old: b"\x00"}):
+                return failed(_TORQUE_STAYS_ON)
+            found.append(Finding("fixed", name, _TORQUE_OFF))
         if new != old:
             line.write(reg.ID, {old: bytes((new,))})
             if line.ping(new) != model.number:
@@ -316,35 +319,31 @@ def _identify(path: str, change: Change, model: ServoModel, result: list[Finding
     with open_line(path, change.baud) as line:
         if line.ping(new) != model.number:
             return failed(f"no reply after its baud rate was set to {change.baud} baud")
-    result.append(Finding("fixed", name, str(change)))
-    return None
+    return [*found, Finding("fixed", name, str(change))]
 
 
-def _set_up(
-    line: ServoLine,
-    settings: Settings,
-    finger: int,
-    model: ServoModel,
-    result: list[Finding],
-) -> None:
+def _set_up(line: ServoLine, settings: Settings, finger: int, model: ServoModel) -> list[Finding]:
     """Write all registers required by `register_table`, and reboot the servo if needed."""
     servo_id = settings.servos.ids[finger]
     name = servo_name(servo_id, finger)
+    found: list[Finding] = []
 
-    def failed(problem: str) -> None:
-        result.append(Finding("warn", name, problem))
+    def failed(problem: str) -> list[Finding]:
+        return [*found, Finding("warn", name, problem)]
 
     # At status return level 0, servos do not reply to reads, so set the level before the first
     # read.
     if line.read(servo_id, reg.STATUS_RETURN_LEVEL, 1) is None:
         if line.store(reg.STATUS_RETURN_LEVEL, {servo_id: b"\x02"}):
             return failed("replies to a ping but not to a read")
-        result.append(Finding("fixed", name, "status return level 0 → 2"))
-    table = line.read(servo_id, 0, CHECKED)
-    if table is None:
+        found.append(Finding("fixed", name, "status return level 0 → 2"))
+    table = Registers.read(line, servo_id)
+    if not table:
         return failed("the registers could not be read")
-    if table[reg.TORQUE_ENABLE] and not _torque_off(line, servo_id, name, result):
-        return None
+    if table[reg.TORQUE_ENABLE]:
+        if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
+            return failed(_TORQUE_STAYS_ON)
+        found.append(Finding("fixed", name, _TORQUE_OFF))
     rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
     # Write the operating mode first, because this write resets gains, profiles and goals.
     for row in sorted(rows, key=lambda row: row.register.address != reg.OPERATING_MODE):
@@ -354,28 +353,25 @@ def _set_up(
             continue
         what, value = row.register.name, row.mended(wrong)
         if line.store(row.register.address, {servo_id: row.register.packed(value)}):
-            failed(f"{what} {wrong} could not be set to {value}")
+            found.append(Finding("warn", name, f"{what} {wrong} could not be set to {value}"))
         else:
-            result.append(Finding("fixed", name, f"{what} {wrong} → {value}", row.then))
-    return _reboot_if_needed(line, settings, finger, model, result)
+            found.append(Finding("fixed", name, f"{what} {wrong} → {value}", row.then))
+    rebooted = _reboot_if_needed(line, settings, finger, model)
+    return [*found, rebooted] if rebooted else found
 
 
 def _reboot_if_needed(
-    line: ServoLine,
-    settings: Settings,
-    finger: int,
-    model: ServoModel,
-    result: list[Finding],
-) -> None:
+    line: ServoLine, settings: Settings, finger: int, model: ServoModel
+) -> Finding | None:
     """Reboot a servo that has a hardware error or has lost a turn.
 
     The caller must correct the servo's limits before the reboot.
     """
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
-    table = Registers(line.read(servo_id, 0, CHECKED) or b"")
+    table = Registers.read(line, servo_id)
     if not table:
-        return result.append(Finding("warn", name, "the registers could not be read"))
+        return Finding("warn", name, "the registers could not be read")
     misplaced = check_position(name, scale, table, settings.hand, finger)
     if error := table[reg.HARDWARE_ERROR_STATUS]:
         why = f"it had a hardware error: {reg.hardware_error_names(error)}"
@@ -388,31 +384,14 @@ def _reboot_if_needed(
         return None
     match _reboot(line, servo_id):
         case None:
-            return result.append(
-                Finding("warn", name, f"no reply after a reboot, which was necessary because {why}")
-            )
+            problem = f"no reply after a reboot, which was necessary because {why}"
+            return Finding("warn", name, problem)
         case 0:
-            return result.append(Finding("fixed", name, f"rebooted because {why}"))
+            return Finding("fixed", name, f"rebooted because {why}")
         case error:
-            text = (
-                "it still reports a hardware error after a reboot: "
-                f"{reg.hardware_error_names(error)}"
-            )
-            return result.append(
-                Finding("warn", name, text, "remove the cause, and run the command again")
-            )
-
-
-def _torque_off(line: ServoLine, servo_id: int, name: str, result: list[Finding]) -> bool:
-    if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
-        result.append(Finding("warn", name, "torque could not be switched off"))
-        return False
-    result.append(
-        Finding(
-            "fixed", name, "torque switched off, because the EEPROM is locked while torque is on"
-        )
-    )
-    return True
+            names = reg.hardware_error_names(error)
+            problem = f"it still reports a hardware error after a reboot: {names}"
+            return Finding("warn", name, problem, "remove the cause, and run the command again")
 
 
 def _reboot(line: ServoLine, servo_id: int) -> int | None:

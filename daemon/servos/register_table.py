@@ -3,7 +3,7 @@
 :func:`required_registers` returns the table in the order of the e-Manual's control table. EEPROM
 values are permanent. RAM values persist until a reboot or a power failure. EEPROM and RAM may
 therefore contain values from another program. `connect` checks the EEPROM, and only `softfinger
-doctor --fix` writes the EEPROM. `arm` writes the RAM registers that are marked ``armed``.
+doctor --fix` writes the EEPROM. `arm` writes the RAM registers of :func:`armed_registers`.
 
 The table omits registers that do not affect goal tracking, limits or bus replies in the hand's
 operating modes. ID and baud rate are also omitted, because a search finds them. The registers for
@@ -90,14 +90,16 @@ _AT: Final = {register.address: register for register in REGISTERS}
 
 
 class Requirement(NamedTuple):
-    """Required value of a register. A wrong value results in a finding with this ``status``."""
+    """Required value of a register. A wrong value results in a finding with this ``status``.
+
+    The status is ``note`` for the RAM registers that `arm` writes.
+    """
 
     register: Register
     holds: Callable[[int], bool]
     mended: Callable[[int], int]  # function that maps a wrong value to the correct value
     told: Callable[[int], str]  # function that describes the wrong value and the expected value
     status: Status
-    armed: bool = False  # True for a RAM register that `arm` writes
     then: str = ""  # action required after the value is corrected
 
     def wrong_in(self, table: bytes, start: int = 0) -> int | None:
@@ -109,9 +111,7 @@ class Requirement(NamedTuple):
         return None if self.holds(value) else value
 
 
-def _exactly(
-    address: int, value: int, why: str, status: Status = "FAIL", armed: bool = False
-) -> Requirement:
+def _exactly(address: int, value: int, why: str, status: Status = "FAIL") -> Requirement:
     register = _AT[address]
     return Requirement(
         register,
@@ -119,7 +119,6 @@ def _exactly(
         lambda _: value,
         lambda found: f"{register.name} is {found}, expected {value}: {why}",
         status,
-        armed,
     )
 
 
@@ -262,7 +261,7 @@ def armed_registers(model: ServoModel) -> list[Requirement]:
         (reg.PROFILE_ACCELERATION, 0),
         (reg.PROFILE_VELOCITY, 0),
     )
-    return [_exactly(address, value, why, "note", True) for address, value in values]
+    return [_exactly(address, value, why, "note") for address, value in values]
 
 
 def _current_limit(model: ServoModel, current_max: float) -> Requirement:

@@ -66,7 +66,6 @@ class SimulatedServos:
         self._goal_current = [0.0, 0.0]
         self._q = [0.0, 0.0]  # last readings of angle [rad] and velocity [rad/s]
         self._dq = [0.0, 0.0]
-        self._seq = 0
         self._errors = [0, 0]  # hardware error bits
         self._pressed = [0.0, 0.0]  # time for which each motor has drawn its maximum current [s]
         self._health_read = -math.inf
@@ -96,8 +95,7 @@ class SimulatedServos:
             reading.current[joint] = scale.amperes(scale.current_counts(current))
         if reading.t - self._health_read >= _HEALTH_INTERVAL:
             self._read_health(reading)
-        self._seq += 1
-        reading.seq = self._seq
+        reading.seq += 1
         reading.lost = reading.frozen = 0
         reading.valid = True
 
@@ -115,10 +113,8 @@ class SimulatedServos:
             limit = min(self._settings.current_limit[joint], self._model.stall_current)
             pressed = self._torque and current >= 0.99 * limit
             self._pressed[joint] = self._pressed[joint] + passed if pressed else 0.0
-            hot, over = (
-                heat.sensed > self._model.temperature_limit,
-                self._pressed[joint] > _OVERLOAD_TIME,
-            )
+            hot = heat.sensed > self._model.temperature_limit
+            over = self._pressed[joint] > _OVERLOAD_TIME
             errors = self._errors[joint] = hot << reg.OVERHEATING | over << reg.OVERLOAD
             reading.hardware[joint] = errors
             reading.alert |= bool(errors) << joint

@@ -85,10 +85,10 @@ class Torque:
             If torque could not be switched on or verified. Torque may be on.
         """
         self._not_after = time.monotonic() + _ON_TIMEOUTS * self._line.port.reply_timeout
-        self._refuse_hardware_errors()
+        tables = self._read_ram()
         # After a watchdog stop, goals are read-only until 0 is written to the watchdog register.
         self._store_all(reg.BUS_WATCHDOG, b"\x00", "watchdog cleared")
-        self._write_registers()
+        self._restore_ram(tables)
         goals = self._choose_goals()
         if self._mode != reg.POSITION_MODE:
             self._store_all(reg.GOAL_CURRENT, bytes(2), "goal current")
@@ -140,45 +140,29 @@ class Torque:
 
     def _choose_goals(self) -> GroupWrite:
         """Return the sync write that sends the goals of a tick (current, position or both)."""
-        address = goal_address(self._mode, self._model, self._firmware())
-        if self._mode == reg.CURRENT_BASED_POSITION_MODE:
-            self._map_goals()
-        return GroupWrite(self._line.port, address, GOAL_SIZE[self._mode], list(self._joints))
-
-    def _map_goals(self) -> None:
-        """Map goal current and goal position to adjacent indirect data."""
-        pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
-        self._store_all(reg.INDIRECT_ADDRESS, pointers, "indirect addresses")
-
-    def _firmware(self) -> int:
-        """Return the highest firmware version of the servos.
-
-        All servos must use the same indirect data address.
-        """
-        found = set()
-        for servo_id, joint in self._joints.items():
-            raw = self._line.read(servo_id, reg.FIRMWARE_VERSION, 1)
-            if raw is None:
-                raise ServoError(f"{joint.name}: no reply")
-            found.add(raw[0])
-        if len({self._model.indirect_blocks(version)[0] for version in found}) > 1:
+        addresses = {
+            goal_address(self._mode, self._model, joint.firmware) for joint in self._joints.values()
+        }
+        if len(addresses) > 1:
             raise ServoError(
                 "servos: found firmware versions with different indirect data addresses: update "
                 "both servos to the same version"
             )
-        return max(found)
+        if self._mode == reg.CURRENT_BASED_POSITION_MODE:
+            # Map goal current and goal position to adjacent indirect data.
+            pointers = struct.pack(f"<{len(_GOAL_BYTES)}H", *_GOAL_BYTES)
+            self._store_all(reg.INDIRECT_ADDRESS, pointers, "indirect addresses")
+        size = GOAL_SIZE[self._mode]
+        return GroupWrite(self._line.port, addresses.pop(), size, list(self._joints))
 
-    def _write_registers(self) -> None:
+    def _restore_ram(self, tables: Mapping[int, bytes]) -> None:
         """Restore RAM registers that another program may have changed.
 
         A servo keeps gains, profiles and the PWM limit until a reboot or a power failure.
         """
-        for servo_id, joint in self._joints.items():
-            held = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
-            if held is None:
-                raise ServoError(f"{joint.name}: the registers could not be read")
+        for servo_id, table in tables.items():
             for row in armed_registers(self._model):
-                if row.wrong_in(held, reg.RAM) is not None:
+                if row.wrong_in(table, reg.RAM) is not None:
                     what, data = row.register.name, row.register.packed(row.mended(0))
                     self._store(row.register.address, {servo_id: data}, what)
 
@@ -193,19 +177,22 @@ class Torque:
             positions[servo_id] = int.from_bytes(raw, "little", signed=True)
         return positions
 
-    def _refuse_hardware_errors(self) -> None:
-        found = []
+    def _read_ram(self) -> dict[int, bytes]:
+        """Return each servo's registers from `RAM` up to the goals; refuse hardware errors."""
+        tables, found = {}, []
         for servo_id, joint in self._joints.items():
-            raw = self._line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
-            if raw is None:
-                found.append(
-                    Finding("FAIL", joint.name, "no reply", "check the power supply and the cable")
-                )
-            elif raw[0]:
-                error = f"hardware error: {reg.hardware_error_names(raw[0])}"
+            table = self._line.read(servo_id, reg.RAM, reg.GOAL_POSITION - reg.RAM)
+            if table is None:
+                fix = "check the power supply and the cable"
+                found.append(Finding("FAIL", joint.name, "no reply", fix))
+            elif status := table[reg.HARDWARE_ERROR_STATUS - reg.RAM]:
+                error = f"hardware error: {reg.hardware_error_names(status)}"
                 found.append(Finding("FAIL", joint.name, error, REBOOT_FIX))
+            else:
+                tables[servo_id] = table
         if found:
             raise ServoError("\n".join(map(str, found)))
+        return tables
 
     # --- checks while torque is on ---------------------------------------------------------------
 

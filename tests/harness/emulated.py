@@ -110,22 +110,14 @@ class SdkServos:
         return bool(result == COMM_RX_TIMEOUT)
 
     def read(self, servo: int, address: int, size: int) -> int:
-        read = {
-            1: self.packets.read1ByteTxRx,
-            2: self.packets.read2ByteTxRx,
-            4: self.packets.read4ByteTxRx,
-        }[size]
-        value, result, error = read(self.port, servo, address)
+        data, result, error = self.packets.readTxRx(self.port, servo, address, size)
         assert (result, error) == (COMM_SUCCESS, 0)
-        return int(value)
+        return int.from_bytes(data, "little")
 
     def write(self, servo: int, address: int, size: int, value: int) -> None:
-        write = {
-            1: self.packets.write1ByteTxRx,
-            2: self.packets.write2ByteTxRx,
-            4: self.packets.write4ByteTxRx,
-        }[size]
-        assert write(self.port, servo, address, value) == (COMM_SUCCESS, 0)
+        data = list(value.to_bytes(size, "little"))
+        done = self.packets.writeTxRx(self.port, servo, address, size, data)
+        assert done == (COMM_SUCCESS, 0)
 
     def close(self) -> None:
         self.port.closePort()

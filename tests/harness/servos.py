@@ -37,12 +37,6 @@ def hand_bus(t: float = 0.0, servos: dict[str, Any] | None = None, **options: An
     return ServoBus.from_settings(settings, FreeJoints(2, t), t=t, **options)
 
 
-def put_fault(bus: ServoBus, text: str, t: float) -> None:
-    """Apply a fault that is given as text, such as ``silent=2``."""
-    kind, _, value = text.partition("=")
-    bus.fault(kind, float(value), t)
-
-
 def backend_settings(path: str, **servos: Any) -> Settings:
     """Return settings for the Dynamixel backend, with timeouts that allow for a busy machine."""
     waits = {"reply_timeout": 1.0, "watchdog": 2.0}
@@ -63,10 +57,13 @@ def lasting_notices(backend: DynamixelServos) -> list[Finding]:
 
 
 class BusClient:
-    """Bus client that has its own clock and parses the replies of one servo."""
+    """Bus client that has its own clock and parses the replies of one servo.
 
-    def __init__(self, bus: ServoBus) -> None:
-        self.bus = bus
+    Without a ``bus``, the client creates factory-new servos; see `make_bus` for the ``options``.
+    """
+
+    def __init__(self, bus: ServoBus | None = None, **options: Any) -> None:
+        self.bus = bus or make_bus(**options)
         self.t = 0.001
 
     def send(self, packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:

@@ -84,7 +84,7 @@ class Rig:
             self.images = source or _Images()
             self.board = TactileBoard(self.images, ENCODERS[backend], RATE, 0.0)
             self._faults = parse_faults([f"right:{fault}"] if fault else [], ())
-            self._stack.callback(self.board.close)
+            self._stack.callback(self.board.unplug)
             tactile["port"] = ("/dev/none", self.board.path)
             thread = threading.Thread(target=self._serve, daemon=True)
             thread.start()

@@ -26,7 +26,6 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
 from softfinger.kinematics.compiled.kernel_folder import find_kernel_folder
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
@@ -43,8 +42,7 @@ class Hand:
         self.folder = folder
         self.settings = load(HIL, folder)
         self._stack = contextlib.ExitStack()
-        servos = EmulatedServos(**options)
-        running = emulated(folder, settings=self.settings, servos=servos)
+        running = emulated(folder, settings=self.settings, **options)
         self.emulator = self._stack.enter_context(running)
 
     def registers(self) -> list[bytes]:

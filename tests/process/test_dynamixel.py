@@ -192,7 +192,9 @@ def test_corrupted_replies_never_give_wrong_readings(running, kind, firmware, co
 @FIRMWARES
 def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connect):
     bus = running(placed(firmware, 0, 0))
-    backend = connect(bus, reply_timeout=0.004, zero=(0, 0))  # Late replies take 0.01 s.
+    # Late replies take 0.01 s. On a busy machine, a reply may be late by several further timeouts.
+    # The request ten timeouts later has the same length again, so the timeout must not be short.
+    backend = connect(bus, reply_timeout=0.008, zero=(0, 0))
     reading = Reading()
 
     def at_another_place(count: int) -> None:

@@ -20,7 +20,6 @@ from softfinger.daemon.simulation.emulator.emulator import (
     DEFAULT_BOARD,
     Emulator,
     EmulatorClock,
-    EmulatorError,
     with_board,
 )
 from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, LinkFolder
@@ -29,8 +28,7 @@ from tests.conftest import until
 from tests.harness.emulated import HIL, EmulatorProcess, SdkServos, board, emulated, send
 from tests.harness.late_machine import LateMachine
 
-RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE = 9, 11, 64
-GOAL_CURRENT, GOAL_POSITION, PRESENT_POSITION = 102, 116, 132
+RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE, PRESENT_POSITION = 9, 11, 64, 132
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +120,7 @@ def test_links_of_a_killed_emulator_are_replaced_and_a_paused_emulator_continues
 @pytest.mark.parametrize("name", ["servos", "control"])
 def test_other_files_in_place_of_links_or_the_control_socket_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("mine")
-    with pytest.raises(EmulatorError, match=f"{name}: .*exists"):
+    with pytest.raises(FolderError, match=f"{name}: .*exists"):
         Emulator(Settings(), tmp_path)
     assert (tmp_path / name).read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -42,7 +42,7 @@ class Board(FrameWriter):
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
-        super().close()
+        self.unplug()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import PluginError, SettingsError
 from softfinger.daemon.profile.load import load
-from softfinger.daemon.simulation.emulator.pty_bus import open_pty
+from softfinger.daemon.simulation.emulator.pty_bus import PtyPort
 from softfinger.testing import check_servos, check_shape, check_tactile
 from softfinger.tools.setup import doctor
 from tests.conftest import until
@@ -93,7 +93,8 @@ def test_the_ascii_board_of_the_documentation_reads_a_port():
     page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     exec(page.split("```python\n")[-1].split("```")[0], names)
-    master, slave, path = open_pty()
+    port = PtyPort()
+    path, master = port.path, port.fileno()
     settings = load(changes=["tactile.rows=4", "tactile.cols=5", f'tactile.port=["{path}", ""]'])
     sensor = names["AsciiBoard"](settings.tactile, RealClock(), 0)
     ended = threading.Event()
@@ -114,5 +115,4 @@ def test_the_ascii_board_of_the_documentation_reads_a_port():
         ended.set()
         sender.join()
         sensor.close()
-        os.close(master)
-        os.close(slave)
+        port.unplug()

@@ -15,7 +15,7 @@ from softfinger.daemon.simulation.emulator.pty_bus import PASSAGE_TIME, PtyServo
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, frame
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from tests.harness.servos import make_bus, put_fault
+from tests.harness.servos import make_bus
 
 PING = frame(1, framing.PING)
 PONG = 14
@@ -86,7 +86,7 @@ def test_replies_take_wire_time_and_return_delay_one_after_another(wires):
 
 def test_a_late_reply_is_late_even_without_pacing(wires):
     wires.append(wire := Wire(make_bus(), 0, spin=0.0))
-    put_fault(wire.port.bus, "late=1", wire.t)
+    wire.port.bus.fault("late", 1.0, wire.t)
     wire.send(PING)
     assert wire.when(0.009) == b""
     assert len(wire.when(0.002)) == PONG

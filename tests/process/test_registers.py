@@ -257,6 +257,11 @@ def test_a_servo_with_protocol_1_is_recognised(bus):
     backend.close()
 
 
+def test_the_registers_of_another_model_are_not_compared(running):
+    bus = running(servos={"model": "XL330-M288"})
+    assert [each.text for each in told(bus)] == ["is an XL330-M288, expected an XM430-W350"]
+
+
 def test_an_unknown_model_lists_the_known_ones(bus):
     put(bus, reg.MODEL_NUMBER, 9999)
     (found,) = [each for each in told(bus) if each.status == "FAIL"]

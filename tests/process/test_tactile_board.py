@@ -78,7 +78,7 @@ def test_each_frame_is_sent_once_and_decoded():
     assert np.array_equal(decoded.data, np.full((ROWS, COLS), 5))
     assert decoder.counters()["frames"] == made.sent == 5
     os.close(client.fd)
-    made.close()
+    made.unplug()
 
 
 def test_the_next_event_is_the_next_frame_delivery():
@@ -96,7 +96,7 @@ def test_the_next_event_is_the_next_frame_delivery():
     assert made.next_event() == pytest.approx(0.0567)
     made.service(0.0638)
     assert made.next_event() == pytest.approx(0.064)
-    made.close()
+    made.unplug()
 
 
 @pytest.mark.parametrize("cells", [48, 1024, 44 * 44, 128 * 128])
@@ -118,7 +118,7 @@ def test_without_a_reader_only_whole_frames_are_dropped(cells):
     assert client.read() == b""
     assert writer.send(frame)  # The board sends again once its output is read.
     os.close(client.fd)
-    writer.close()
+    writer.unplug()
 
 
 def test_client_bytes_are_consumed_without_echo():
@@ -128,7 +128,7 @@ def test_client_bytes_are_consumed_without_echo():
     made.hear()
     assert client.read() == b""
     os.close(client.fd)
-    made.close()
+    made.unplug()
 
 
 @pytest.mark.parametrize("kind", ["noisy", "saturated", "zero"])
@@ -146,4 +146,4 @@ def test_bytes_on_the_line_during_faults(kind):
         else:
             assert data == encode_flexitac(np.full((ROWS, COLS), 255 * (kind == "saturated")))
     os.close(client.fd)
-    made.close()
+    made.unplug()

@@ -2,7 +2,6 @@
 
 import math
 import struct
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -16,11 +15,7 @@ from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST
 from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
 from softfinger.daemon.simulation.servo_model.servo_joint import OVERLOAD_TIME, Profile
-from tests.harness.servos import RADIAN, BusClient, make_bus, put_fault
-
-
-def client(**options: Any) -> BusClient:
-    return BusClient(make_bus(**options))
+from tests.harness.servos import RADIAN, BusClient
 
 
 @pytest.mark.parametrize(
@@ -50,7 +45,7 @@ def client(**options: Any) -> BusClient:
     ],
 )
 def test_status_errors_of_writes(address: int, value: int, size: int, error: int) -> None:
-    c = client(model="XM430-W210")
+    c = BusClient(model="XM430-W210")
     before = bytes(c.bus.servos[0].table.memory)
     assert c.write(address, value, size) == error
     if error:
@@ -58,7 +53,7 @@ def test_status_errors_of_writes(address: int, value: int, size: int, error: int
 
 
 def test_configured_limits_are_enforced() -> None:
-    c = client()
+    c = BusClient()
     assert c.write(reg.CURRENT_LIMIT, 500, 2) == 0
     assert c.write(reg.GOAL_CURRENT, 501, 2) == framing.DATA_LIMIT
     assert c.write(reg.MAX_POSITION_LIMIT, 3000, 4) == 0
@@ -67,7 +62,7 @@ def test_configured_limits_are_enforced() -> None:
 
 
 def test_eeprom_is_locked_while_torque_is_on() -> None:
-    c = client()
+    c = BusClient()
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
     assert c.write(reg.RETURN_DELAY_TIME, 0, 1) == framing.ACCESS
     assert c.write(reg.TORQUE_ENABLE, 0, 1) == 0
@@ -83,14 +78,14 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     ],
 )
 def test_unknown_instructions_are_refused(instruction: int, parameters: bytes) -> None:
-    c = client()
+    c = BusClient()
     before = bytes(c.bus.servos[0].table.memory)
     assert c.ask(instruction, parameters) == (framing.INSTRUCTION_ERROR, b"")
     assert bytes(c.bus.servos[0].table.memory) == before
 
 
 def test_a_registered_write_waits_for_the_action() -> None:
-    c = client()
+    c = BusClient()
     led = struct.pack("<HB", reg.LED, 1)
     assert c.ask(framing.REG_WRITE, led) == (framing.OK, b"")
     assert (c.read(reg.LED, 1), c.read(reg.REGISTERED_INSTRUCTION, 1)) == (0, 1)
@@ -105,14 +100,14 @@ def test_a_registered_write_waits_for_the_action() -> None:
 
 
 def test_a_shadow_id_is_executed_without_a_reply() -> None:
-    c = client()
+    c = BusClient()
     assert c.write(reg.SHADOW_ID, 2, 1) == 0
     assert c.write(reg.LED, 1, 1, packet_id=2) == 0  # The packet is addressed to servo 2.
     assert [servo.table.get(reg.LED) for servo in c.bus.servos] == [1, 1]
 
 
 def test_torque_on_at_power_up_if_configured() -> None:
-    c = client()
+    c = BusClient()
     assert c.write(reg.STARTUP_CONFIGURATION, 1, 1) == 0
     c.ask(framing.REBOOT)
     c.later(REBOOT_TIME + 0.01)
@@ -120,7 +115,7 @@ def test_torque_on_at_power_up_if_configured() -> None:
 
 
 def test_protocol_1_if_configured() -> None:
-    c = client()
+    c = BusClient()
     c.bus.servos[0].table.set(reg.PROTOCOL_TYPE, 1)
     assert c.send(1, framing.PING) == b""
     # The packet is an example from the e-Manual's page on Protocol 1.0.
@@ -135,7 +130,7 @@ def test_protocol_1_if_configured() -> None:
 
 def travelled(*writes: tuple[int, int, int], time: float = 0.1) -> float:
     """Return the distance [counts] that a servo moves in ``time`` [s] if its goal is at 300."""
-    c = client(for_daemon=True)
+    c = BusClient(for_daemon=True)
     for address, value, size in writes:
         assert c.write(address, value, size) == 0
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0
@@ -169,7 +164,7 @@ def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
     # The joint lags behind the profile, so the distance is shorter than at 20 · 0.229 rpm.
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
-    c = client()
+    c = BusClient()
     for address, value, size in (
         (reg.OPERATING_MODE, reg.VELOCITY_MODE, 1),
         (reg.TORQUE_ENABLE, 1, 1),
@@ -185,7 +180,7 @@ def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     ("model", "firmware"), [("XM430-W210", 48), ("XL330-M288", 52), ("XL330-M288", 53)]
 )
 def test_indirect_data_is_redirected_to_its_address(model: str, firmware: int) -> None:
-    c = client(model=model, firmware=firmware, counts=(166, 0))
+    c = BusClient(model=model, firmware=firmware, counts=(166, 0))
     address, data, _ = by_name(model).indirect_blocks(firmware)[0]
     for i, target in enumerate((reg.LED, *range(reg.PRESENT_POSITION, reg.PRESENT_POSITION + 4))):
         assert c.write(address + 2 * i, target, 2) == 0
@@ -198,7 +193,7 @@ def test_indirect_data_is_redirected_to_its_address(model: str, firmware: int) -
 
 
 def test_velocity_mode_keeps_its_velocity() -> None:
-    c = client()
+    c = BusClient()
     c.write(reg.OPERATING_MODE, reg.VELOCITY_MODE, 1)
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.write(reg.GOAL_VELOCITY, 60, 4)
@@ -207,7 +202,7 @@ def test_velocity_mode_keeps_its_velocity() -> None:
 
 
 def test_a_velocity_based_profile_takes_the_expected_time() -> None:
-    c = client()
+    c = BusClient()
     c.write(reg.PROFILE_VELOCITY, 50, 4)  # At 11.45 rpm, 1024 counts take 1.31 s.
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.write(reg.GOAL_POSITION, 1024, 4)
@@ -220,7 +215,7 @@ def test_a_velocity_based_profile_takes_the_expected_time() -> None:
 
 
 def test_a_time_based_profile_takes_the_expected_time() -> None:
-    c = client()
+    c = BusClient()
     c.write(reg.DRIVE_MODE, 4, 1)
     c.write(reg.PROFILE_VELOCITY, 2000, 4)  # ms
     c.write(reg.PROFILE_ACCELERATION, 500, 4)
@@ -235,7 +230,7 @@ def test_a_time_based_profile_takes_the_expected_time() -> None:
 
 
 def test_a_mode_change_resets_goals_gains_and_profiles() -> None:
-    c = client(counts=(700, 0))
+    c = BusClient(counts=(700, 0))
     for address, value, size in (
         (reg.POSITION_P_GAIN, 5, 2),
         (reg.PROFILE_VELOCITY, 30, 4),
@@ -252,7 +247,7 @@ def test_a_mode_change_resets_goals_gains_and_profiles() -> None:
 
 
 def test_turns_are_kept_until_position_mode_or_clear() -> None:
-    c = client(for_daemon=True)
+    c = BusClient(for_daemon=True)
     c.bus.plant.q[0] = 5000 * RADIAN
     assert c.read(reg.PRESENT_POSITION, 4) == 5000
     assert c.ask(framing.CLEAR, b"\x01DXL\x22")[0] == 0
@@ -266,7 +261,7 @@ def test_turns_are_kept_until_position_mode_or_clear() -> None:
 
 
 def test_homing_offset_and_reverse_mode() -> None:
-    c = client(counts=(100, 0))
+    c = BusClient(counts=(100, 0))
     assert c.write(reg.HOMING_OFFSET, -30, 4) == 0
     assert c.read(reg.PRESENT_POSITION, 4) == 70
     assert c.write(reg.DRIVE_MODE, 1, 1) == 0
@@ -274,7 +269,7 @@ def test_homing_offset_and_reverse_mode() -> None:
 
 
 def test_realtime_tick_wraps() -> None:
-    c = client()
+    c = BusClient()
     c.later(32.766 - c.t)
     assert c.read(reg.REALTIME_TICK, 2) == 32766
     c.later(0.003)
@@ -282,7 +277,7 @@ def test_realtime_tick_wraps() -> None:
 
 
 def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() -> None:
-    c = client(for_daemon=True)
+    c = BusClient(for_daemon=True)
     c.write(reg.TORQUE_ENABLE, 1, 1)
     c.write(reg.BUS_WATCHDOG, 5, 1)
     c.write(reg.GOAL_CURRENT, 40, 2)
@@ -307,20 +302,18 @@ def test_a_watchdog_trip_stops_motion_and_locks_goals_until_zero_is_written() ->
     assert c.read(reg.BUS_WATCHDOG, 1) == 1
 
 
-@pytest.mark.parametrize(
-    ("fault", "bit"), [("overheat=1", 2), ("overload=1", 5), ("undervoltage=1", 0)]
-)
+@pytest.mark.parametrize(("fault", "bit"), [("overheat", 2), ("overload", 5), ("undervoltage", 0)])
 def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> None:
-    c = client(model="XL330-M288")  # The model's shutdown mask includes all three errors.
+    c = BusClient(model="XL330-M288")  # The model's shutdown mask includes all three errors.
     c.write(reg.TORQUE_ENABLE, 1, 1)
-    put_fault(c.bus, fault, c.t)
+    c.bus.fault(fault, 1, c.t)
     c.later(0.02)
     error, data = c.ask(framing.READ, struct.pack("<HH", reg.HARDWARE_ERROR_STATUS, 1))
     assert error == framing.ALERT
     assert data[0] == 1 << bit
     assert c.bus.servos[0].torque_on is False
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == framing.ALERT | framing.RESULT_FAIL
-    put_fault(c.bus, "recover=1", c.t)
+    c.bus.fault("recover", 1, c.t)
     assert c.ask(framing.REBOOT)[0] == framing.ALERT
     assert c.send(1, framing.PING) == b""
     c.later(REBOOT_TIME)
@@ -329,16 +322,16 @@ def test_hardware_errors_disable_torque_until_a_reboot(fault: str, bit: int) -> 
 
 
 def test_an_error_outside_the_shutdown_mask_only_sets_the_alert() -> None:
-    c = client()  # The XM430's mask of 52 excludes the voltage bit.
+    c = BusClient()  # The XM430's mask of 52 excludes the voltage bit.
     c.write(reg.TORQUE_ENABLE, 1, 1)
-    put_fault(c.bus, "undervoltage=1", c.t)
+    c.bus.fault("undervoltage", 1, c.t)
     c.later(0.02)
     assert c.write(reg.LED, 1, 1) == framing.ALERT
     assert c.bus.servos[0].torque_on is True
 
 
 def test_overload_after_the_allowed_time_at_the_current_limit() -> None:
-    c = client()
+    c = BusClient()
     c.write(reg.CURRENT_LIMIT, 30, 2)
     c.write(reg.OPERATING_MODE, reg.CURRENT_MODE, 1)
     c.write(reg.TORQUE_ENABLE, 1, 1)
@@ -351,7 +344,7 @@ def test_overload_after_the_allowed_time_at_the_current_limit() -> None:
 
 
 def test_reboot_resets_ram_and_keeps_eeprom() -> None:
-    c = client(counts=(1234, 0))
+    c = BusClient(counts=(1234, 0))
     for address, value, size in (
         (reg.RETURN_DELAY_TIME, 3, 1),
         (reg.LED, 1, 1),
@@ -378,7 +371,7 @@ def test_reboot_resets_ram_and_keeps_eeprom() -> None:
 )
 def test_unit_conversions_are_inverse(direction: int, zero: int, ratio: float, counts: int) -> None:
     servos = ServoSettings(direction=(direction, direction), zero=(zero, zero), gear_ratio=ratio)
-    scale = JointScale.of(servos, 1)
+    scale = JointScale.of(servos, 1, by_name(servos.model))
     assert scale.position_counts(scale.angle(counts)) == counts
     assert scale.velocity_counts(scale.rate(counts)) == counts
     assert scale.current_counts(scale.amperes(counts)) == counts
@@ -392,7 +385,7 @@ def test_unit_conversions_are_inverse(direction: int, zero: int, ratio: float, c
     ("option", "new_id", "baud"), [(0xFF, 1, 1), (1, 5, 1), (2, 5, 3)], ids=["all", "id", "baud"]
 )
 def test_factory_reset_options(option: int, new_id: int, baud: int) -> None:
-    c = client(ids=(5, 6))
+    c = BusClient(ids=(5, 6))
     c.write(reg.BAUD_RATE, 3, 1, packet_id=5)
     c.write(reg.RETURN_DELAY_TIME, 3, 1, packet_id=5)
     assert c.ask(framing.FACTORY_RESET, bytes((option,)), packet_id=5)[0] == 0
@@ -402,7 +395,7 @@ def test_factory_reset_options(option: int, new_id: int, baud: int) -> None:
 
 
 def test_a_broadcast_full_factory_reset_is_ignored() -> None:
-    c = client(ids=(5, 6))
+    c = BusClient(ids=(5, 6))
     assert c.send(BROADCAST, framing.FACTORY_RESET, b"\xff") == b""
     assert c.ask(framing.PING, packet_id=5)[0] == 0
     assert c.ask(framing.FACTORY_RESET, b"\x07", packet_id=5)[0] == framing.DATA_RANGE

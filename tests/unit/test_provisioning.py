@@ -23,7 +23,7 @@ from softfinger.daemon.servos.provisioning import (
 )
 from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from tests.harness.servos import DirectPort, put_fault
+from tests.harness.servos import DirectPort
 
 MODEL = by_name("XM430-W350")
 RATES = MODEL.baud_rates
@@ -94,7 +94,7 @@ OTHER_IDS = {**ONLY_LEFT, "servos": {"ids": (11, 12)}}
 def test_servos_are_identified(settings, found, told):
     servos = tuple(each for each in found if isinstance(each, FoundServo))
     garbled = tuple(each for each in found if isinstance(each, Garbled))
-    what = plan(Found(servos, garbled), Settings.model_validate(settings), MODEL, RATES)
+    what = plan(Found(servos, garbled), Settings.model_validate(settings), MODEL)
     changes = [f"{each.finger}: {each}" for each in what.changes]
     missing = [f"missing {finger}" for finger in what.missing]
     assert changes + missing + [f"stranger {s.id}@{s.baud}" for s in what.strangers] == told
@@ -212,7 +212,7 @@ def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
 @pytest.mark.parametrize(
     ("fault", "register", "value", "done"),
     [
-        ("overload=2", None, 0, f"{RIGHT}: rebooted because it had a hardware error: overload"),
+        ("overload", None, 0, f"{RIGHT}: rebooted because it had a hardware error: overload"),
         (
             "",
             reg.TORQUE_ENABLE,
@@ -226,7 +226,7 @@ def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
 def test_configured_registers(wired, fault, register, value, done):
     bus = wired()
     if fault:
-        put_fault(bus.bus, fault, 0.0)
+        bus.bus.fault(fault, 2, 0.0)
     if register is not None:
         bus.servos[0].table.set(register, value)
     assert bus.provision() == ([done], [])
@@ -237,7 +237,7 @@ def test_configured_registers(wired, fault, register, value, done):
 
 def test_failed_and_successful_configurations_are_both_reported(wired):
     bus = wired(factory=True)
-    put_fault(bus.bus, "silent=2", 0.0)
+    bus.bus.fault("silent", 2, 0.0)
     missing = f"{RIGHT}: no reply at any baud rate: check the power supply and the cable"
     assert bus.provision() == (named(LEFT, *MODE_AND_DELAY), [missing])
     _, problems = bus.provision(model="XL330-M288")

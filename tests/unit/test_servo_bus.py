@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model import framing
@@ -12,11 +13,7 @@ from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketPa
 from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.fuzz.servo_bus import fuzz
-from tests.harness.servos import RADIAN, BusClient, hand_bus, make_bus, put_fault
-
-
-def client(**options: Any) -> BusClient:
-    return BusClient(make_bus(**options))
+from tests.harness.servos import RADIAN, BusClient, hand_bus, make_bus
 
 
 def hexes(*texts: str) -> bytes:
@@ -122,7 +119,7 @@ def test_published_fast_bulk_read() -> None:
     ("level", "answers"), [(0, (True, False, False)), (1, (True, True, False)), (2, (True,) * 3)]
 )
 def test_status_return_level(level: int, answers: tuple[bool, bool, bool]) -> None:
-    c = client()
+    c = BusClient()
     c.write(reg.STATUS_RETURN_LEVEL, level, 1)
     replies = (
         c.send(1, framing.PING),
@@ -134,21 +131,21 @@ def test_status_return_level(level: int, answers: tuple[bool, bool, bool]) -> No
 
 
 def test_a_new_id_takes_effect_after_the_reply_under_the_old_one() -> None:
-    c = client()
+    c = BusClient()
     assert c.write(reg.ID, 40, 1) == 0
     assert c.send(1, framing.PING) == b""
     assert c.ask(framing.PING, packet_id=40)[0] == 0
 
 
 def test_broadcast_reads_and_writes_get_no_reply() -> None:
-    c = client()
+    c = BusClient()
     assert c.send(BROADCAST, framing.READ, struct.pack("<HH", 132, 4)) == b""
     assert c.send(BROADCAST, framing.WRITE, struct.pack("<HB", reg.LED, 1)) == b""
     assert all(servo.table.get(reg.LED) for servo in c.bus.servos)
 
 
 def test_a_missing_servo_silences_those_listed_after_it() -> None:
-    c = client(ids=(1, 2, 3))
+    c = BusClient(ids=(1, 2, 3))
     packets = PacketParser().feed(
         c.send(BROADCAST, framing.SYNC_READ, struct.pack("<HH", 132, 4) + bytes((1, 9, 3))), 0.0
     )
@@ -157,10 +154,10 @@ def test_a_missing_servo_silences_those_listed_after_it() -> None:
 
 def test_an_old_firmware_lacks_fast_reads() -> None:
     request = struct.pack("<HHBB", 132, 4, 1, 2)
-    old = client(model="XL330-M288", firmware=45)
+    old = BusClient(model="XL330-M288", firmware=45)
     assert old.send(BROADCAST, framing.FAST_SYNC_READ, request) == b""
     assert len(old.send(BROADCAST, framing.SYNC_READ, request)) == 2 * 15
-    new = client(model="XL330-M288", firmware=46)
+    new = BusClient(model="XL330-M288", firmware=46)
     assert len(new.send(BROADCAST, framing.FAST_SYNC_READ, request)) == 8 + 2 * 8
 
 
@@ -171,7 +168,7 @@ def test_a_corrupted_packet_gets_no_reply() -> None:
 
 
 def test_servos_at_another_rate_receive_nothing() -> None:
-    c = client()
+    c = BusClient()
     ping = frame(BROADCAST, framing.PING)
     assert c.bus.feed(ping, c.t, baud=1_000_000) == b""
     assert len(c.bus.feed(ping, c.t, baud=57600)) == 28
@@ -201,33 +198,33 @@ def test_servos_with_the_same_id_reply_simultaneously() -> None:
 
 
 def test_reply_faults_are_injected_reproducibly() -> None:
-    def replies(fault: str) -> list[bytes]:
+    def replies(fault: str, chance: float) -> list[bytes]:
         bus = make_bus()
-        put_fault(bus, fault, 0.0)
+        bus.fault(fault, chance, 0.0)
         ping = frame(1, framing.PING)
         return [bus.feed(ping, 0.001 * i) for i in range(400)]
 
     whole = make_bus().feed(frame(1, framing.PING), 0.0)
-    dropped = replies("drop=0.25")
+    dropped = replies("drop", 0.25)
     assert 60 < dropped.count(b"") < 140
     assert set(dropped) == {b"", whole}
-    assert all(reply == whole[: len(reply)] for reply in replies("truncate=1"))
-    assert set(replies("duplicate=1")) == {whole + whole}
-    for reply in replies("corrupt=1"):
+    assert all(reply == whole[: len(reply)] for reply in replies("truncate", 1))
+    assert set(replies("duplicate", 1)) == {whole + whole}
+    for reply in replies("corrupt", 1):
         flipped = int.from_bytes(reply, "big") ^ int.from_bytes(whole, "big")
         assert flipped.bit_count() == 1
-    assert replies("drop=0.25") == dropped
+    assert replies("drop", 0.25) == dropped
     late = make_bus()
-    put_fault(late, "late=1", 0.0)
+    late.fault("late", 1.0, 0.0)
     assert late.exchange(frame(1, framing.PING), 0.0)[0].late > 0.0
 
 
 def test_a_silent_servo_can_be_restored() -> None:
-    c = client()
-    put_fault(c.bus, "silent=2", c.t)
+    c = BusClient()
+    c.bus.fault("silent", 2, c.t)
     assert c.send(2, framing.PING) == b""
     assert c.send(1, framing.PING) != b""
-    put_fault(c.bus, "answer=2", c.t)
+    c.bus.fault("answer", 2, c.t)
     assert c.send(2, framing.PING) != b""
 
 
@@ -244,12 +241,12 @@ def test_directions_and_zero_offsets_of_the_settings() -> None:
     assert c.read(reg.PRESENT_POSITION, 4, 1) == 2048 + turn
     assert c.read(reg.PRESENT_POSITION, 4, 2) == 2048 - turn
     assert c.read(reg.OPERATING_MODE, 1, 2) == reg.CURRENT_BASED_POSITION_MODE
-    with pytest.raises(ValueError, match="does not support 4500000 baud"):
+    with pytest.raises(SettingsError, match="does not support 4500000 baud"):
         hand_bus(servos={"model": "XL330-M288"}, baud=4_500_000)
 
 
 def test_a_reading_may_lag_behind_the_plant_but_writes_and_watchdogs_may_not() -> None:
-    c = client(for_daemon=True)
+    c = BusClient(for_daemon=True)
     bus = c.bus
     bus.lag = 0.0005
     c.write(reg.TORQUE_ENABLE, 1, 1)

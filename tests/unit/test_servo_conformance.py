@@ -3,7 +3,6 @@
 Both backends must pass the same tests. To test another backend, add it to ``RIGS``.
 """
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from typing import Any, Protocol
@@ -23,9 +22,8 @@ from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
 from tests.harness.plant import PAPER
-from tests.harness.servos import DirectPort, put_fault
+from tests.harness.servos import RADIAN, DirectPort
 
-COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
 MODES = ("current-based position", "current", "position")
 BOUNDED = ("current-based position", "current")
@@ -40,9 +38,6 @@ class Rig(Protocol):
     def torque(self) -> list[bool]:
         """Return a list that contains True for each servo whose motor is driven."""
 
-    def close(self) -> None:
-        """Close the backend."""
-
 
 class SimulatedRig:
     """The simulated backend, which uses a virtual clock."""
@@ -51,15 +46,11 @@ class SimulatedRig:
         settings = Settings.model_validate({"material": {"law": "constant"}, **sections})
         self.clock: Clock = VirtualClock()
         self._hand = SimulatedHand(settings, table=PAPER)
-        made = make_servos(settings, self.clock, self._hand)
-        self.servos = made
+        self.servos = make_servos(settings, self.clock, self._hand)
 
     def torque(self) -> list[bool]:
         self._hand.advance(self.clock.now())
         return [bool(on) for on in self._hand.torque_on]
-
-    def close(self) -> None:
-        self.servos.close()
 
 
 class DynamixelRig:
@@ -83,9 +74,6 @@ class DynamixelRig:
     def torque(self) -> list[bool]:
         return [servo.torque_on for servo in self.bus.servos]
 
-    def close(self) -> None:
-        self.servos.close()
-
 
 RIGS: dict[str, Callable[..., Rig]] = {"simulated": SimulatedRig, "dynamixel": DynamixelRig}
 
@@ -99,7 +87,8 @@ def make(
     def start(mode: str = MODES[0], **sections: Any) -> Rig:
         servos = {"mode": mode, "watchdog": 0.5, **sections.pop("servos", {})}
         rig = RIGS[request.param](monkeypatch, servos=servos, **sections)
-        return stack.enter_context(closing(rig))
+        stack.enter_context(closing(rig.servos))
+        return rig
 
     with ExitStack() as stack:
         yield start
@@ -147,7 +136,7 @@ def test_torque_on_holds_the_current_positions(make, mode):
     before = armed(rig)
     assert rig.torque() == [True, True]
     after = ticks(rig, Goal(q=list(before.q), current=[0.5, 0.5]), 0.1)[-1]
-    assert after.q == pytest.approx(before.q, abs=1.5 * COUNT)
+    assert after.q == pytest.approx(before.q, abs=1.5 * RADIAN)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -187,7 +176,7 @@ def test_zero_current_causes_no_motion(make, mode):
     rig = make(mode)
     armed(rig)
     readings = ticks(rig, Goal(q=[0.1, -0.3], current=[0.0, 0.0]), 0.1)
-    assert readings[-1].q == pytest.approx([0.0, 0.0], abs=1.5 * COUNT)
+    assert readings[-1].q == pytest.approx([0.0, 0.0], abs=1.5 * RADIAN)
     assert max(abs(current) for r in readings for current in r.current) <= CURRENT_UNIT
 
 
@@ -213,7 +202,7 @@ def test_torque_off_and_close_release_the_joints(make, mode):
 def test_a_finger_outside_the_scene_stays_zero(make, mode):
     rig = make(mode, scene={"fingers": ("right",)})
     if isinstance(rig, DynamixelRig):
-        put_fault(rig.bus, "silent=1", 0.0)  # The backend does not use servo 1.
+        rig.bus.fault("silent", 1, 0.0)  # The backend does not use servo 1.
     armed(rig)
     reading = ticks(rig, Goal(q=[0.1, -0.1], current=[0.4, 0.4]), 0.4)[-1]
     assert reading.q[0] == reading.dq[0] == reading.current[0] == 0.0
@@ -255,7 +244,7 @@ def test_position_limits_that_exclude_the_joint_range_are_reported(monkeypatch):
     rig.servos.connect()
     notices = [each.text for each in rig.servos.notices]
     assert notices.count('servos.mode = "position" does not limit the current of the servo') == 2
-    rig.close()
+    rig.servos.close()
 
 
 @pytest.mark.parametrize("mode", BOUNDED)

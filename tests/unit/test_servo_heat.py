@@ -131,7 +131,7 @@ def test_servo_constants_are_identified_from_a_hold(tmp_path, monkeypatch, capsy
     state, own = HeatState(), load(profile)
     set_law(state.law, own)
     follow(state.array, 1.0, 0.5, 25.0)
-    plant.cool()
+    plant.warm(25.0)
     state.x[:3] = 25.0
     told = time_to_limit(state.array, 1.0, 60.0)
     t = 0.0

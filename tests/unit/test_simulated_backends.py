@@ -14,8 +14,8 @@ from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.simulation.sensor.simulated_tactile import Arrivals, SimulatedTactile
 from softfinger.daemon.types import Goal, Reading
 from tests.harness.plant import PAPER
+from tests.harness.servos import RADIAN
 
-COUNT = 2 * math.pi / 4096
 CURRENT_UNIT = 2.69e-3
 
 
@@ -62,7 +62,7 @@ def test_goals_are_whole_counts():
     bench.run(1.0)
 
     goal_q, bound = bench.hand.plant.goals.q, bench.hand.plant.goals.current
-    np.testing.assert_allclose(goal_q / COUNT, np.round(0.1003 / COUNT), rtol=1e-12)
+    np.testing.assert_allclose(goal_q / RADIAN, np.round(0.1003 / RADIAN), rtol=1e-12)
     # The limit is rounded down, so that the servo never exceeds it.
     np.testing.assert_allclose(bound / CURRENT_UNIT, math.floor(0.3 / CURRENT_UNIT), rtol=1e-12)
 

@@ -20,7 +20,7 @@ from softfinger.daemon.profile.load import find, load, profile_text
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.heat import set_law
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.checks import CHECKED, DRIVE_REVERSE, Registers
+from softfinger.daemon.servos.checks import DRIVE_REVERSE, Registers
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.calibration.calibration import CalibrationError
@@ -98,7 +98,7 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
     """Return all servo positions; raise ServoError if torque is on or a value exceeds one turn."""
     counts = {}
     for servo in ids:
-        table = Registers(line.read(servo, 0, CHECKED) or b"")
+        table = Registers.read(line, servo)
         if not table:
             raise ServoError(f"servo {servo}: no reply: run `softfinger doctor`")
         if table[reg.TORQUE_ENABLE]:

@@ -166,27 +166,23 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
 
     gc.disable()  # Garbage collection during imports would take a tenth of the start-up time.
     from softfinger.daemon.loop.warm_up import EMULATED
-    from softfinger.daemon.simulation.emulator.emulator import (
-        EmulatedServos,
-        Emulator,
-        EmulatorError,
-        with_board,
-    )
+    from softfinger.daemon.simulation.emulator.emulator import Emulator, with_board
     from softfinger.tools.processes.compile import build_kernels, print_event
 
     build_kernels(with_board(settings), print_event, EMULATED)
-    servos = EmulatedServos(arguments.baud, arguments.factory, arguments.ids)
     with contextlib.ExitStack() as made:
         with signals.deferred():
             try:
                 emulator = Emulator(
                     settings,
                     arguments.dir,
-                    servos=servos,
+                    baud=arguments.baud,
+                    factory=arguments.factory,
+                    ids=arguments.ids,
                     faults=arguments.fault,
                     tell=lambda line: print(line, file=sys.stderr, flush=True),
                 )
-            except (EmulatorError, SettingsError) as error:
+            except SoftfingerError as error:
                 print(f"softfinger: {error}", file=sys.stderr)
                 return 1
             made.callback(emulator.close)

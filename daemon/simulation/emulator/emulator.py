@@ -16,21 +16,14 @@ import os
 import selectors
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.clock import Deadline
-from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.simulation.emulator.folder import (
-    ControlPort,
-    FolderError,
-    LinkFolder,
-    find_ports,
-)
+from softfinger.daemon.simulation.emulator.folder import ControlPort, LinkFolder, find_ports
 from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard, encoder_for
@@ -66,10 +59,6 @@ DEFAULT_BOARD = {
     "pascal_per_count": 500.0,
     "full_count": 255,
 }
-
-
-class EmulatorError(SoftfingerError):
-    """Failure to set up the emulated hand. The error message states the reason and a remedy."""
 
 
 class EmulatorClock:
@@ -123,15 +112,6 @@ class EmulatorClock:
         return -delay
 
 
-@dataclass(frozen=True, slots=True)
-class EmulatedServos:
-    """Servo options that are not part of the settings."""
-
-    baud: int = 0  # 0 to reply immediately at any baud rate
-    factory: bool = False  # True to use factory defaults, except for IDs and baud rate
-    ids: tuple[int, ...] | None = None  # IDs that replace the configured IDs; duplicates allowed
-
-
 class Emulator:
     """Emulated hand; ``folder`` contains links to its ports, which :meth:`run` serves.
 
@@ -143,7 +123,9 @@ class Emulator:
         settings: Settings,
         folder: Path,
         *,
-        servos: EmulatedServos | None = None,
+        baud: int = 0,
+        factory: bool = False,
+        ids: tuple[int, ...] | None = None,
         faults: Iterable[str] = (),
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
@@ -153,8 +135,14 @@ class Emulator:
 
         Parameters
         ----------
-        settings, folder, servos
-            Hand settings, folder for the links, and servo options.
+        settings, folder
+            Hand settings, and folder for the links.
+        baud
+            Baud rate of the servos, or 0 for servos that reply immediately at any baud rate.
+        factory
+            True for servos with factory defaults, except for IDs and baud rate.
+        ids
+            Servo IDs that replace the configured IDs. Duplicates are allowed.
         faults
             Faults; see :func:`parse_faults`.
         tell
@@ -162,14 +150,16 @@ class Emulator:
 
         Raises
         ------
-        EmulatorError
+        FolderError, FaultError
             If the folder can't be used or a fault is invalid.
         SettingsError
-            If the material is not a valid stress-strain law.
+            If the material is not a valid stress-strain law, or if the servo model does not support
+            the baud rate.
         """
-        self._closers: list[Callable[[], None]] = []
+        self._closing = contextlib.ExitStack()
         self._wake = os.pipe()
-        self._closers.append(self._close_wake)
+        for end in self._wake:
+            self._closing.callback(os.close, end)
         self._stopping = False
         # `poll` and `epoll` have a resolution of only 1 ms.
         self._selector = selectors.SelectSelector()
@@ -182,41 +172,32 @@ class Emulator:
         self._tell = tell
         self._advance_due = 0.0
         try:
-            servos = servos or EmulatedServos()
-            self._ids = settings.servos.ids if servos.ids is None else servos.ids
+            self._ids = settings.servos.ids if ids is None else ids
             self._events = parse_faults(faults, self._ids)
             self._links = LinkFolder(folder)
-            self._closers.append(self._links.close)
+            self._closing.callback(self._links.close)
             self._control = ControlPort(folder, self._answer, self._selector)
-            self._closers.append(self._control.close)
+            self._closing.callback(self._control.close)
             settings = with_board(settings)
             self._simulation = settings.simulation
             deadline = Deadline(self._links.path / Deadline.NAME, os.O_CREAT)
-            self._closers.append((self._links.path / Deadline.NAME).unlink)
+            self._closing.callback((self._links.path / Deadline.NAME).unlink)
             self.clock = EmulatorClock(deadline)
             table = make_table(settings, make_material(settings.material))
             self.hand = SimulatedHand(settings, 0.0, table)
             if settings.servos.backend != "none":
-                self._add_servos(settings, servos)
+                self._add_servos(settings, baud, factory)
             if settings.tactile.backend != "none":
                 for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
                     self._add_board(settings, finger)
-        except (FolderError, FaultError) as error:
-            self.close()
-            raise EmulatorError(str(error)) from None
         except BaseException:
             self.close()
             raise
 
-    def _add_servos(self, settings: Settings, line: EmulatedServos) -> None:
-        try:
-            bus = ServoBus.from_settings(
-                settings, self.hand, ids=self._ids, baud=line.baud, factory=line.factory
-            )
-        except ValueError as error:
-            raise EmulatorError(str(error)) from None
-        servos = PtyServoBus(bus, baud=line.baud, clock=self.clock.now)
-        self._closers.append(servos.unplug)
+    def _add_servos(self, settings: Settings, baud: int, factory: bool) -> None:
+        bus = ServoBus.from_settings(settings, self.hand, ids=self._ids, baud=baud, factory=factory)
+        servos = PtyServoBus(bus, baud=baud, clock=self.clock.now)
+        self._closing.callback(servos.unplug)
         self._links.link("servos", servos.path)
         self._servos = self.clock.servos = servos
         self._selector.register(servos, selectors.EVENT_READ)
@@ -235,7 +216,7 @@ class Emulator:
         self._sources[FINGERS[finger]] = source
         self._boards[FINGERS[finger]] = board
         self._selector.register(board, selectors.EVENT_READ, board.hear)
-        self._closers.append(board.close)
+        self._closing.callback(board.unplug)
         self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
@@ -263,13 +244,8 @@ class Emulator:
 
     def close(self) -> None:
         """Remove the ports and their links. Never raises."""
-        while self._closers:
-            with contextlib.suppress(OSError):
-                self._closers.pop()()
-
-    def _close_wake(self) -> None:
-        for end in self._wake:
-            os.close(end)
+        with contextlib.suppress(OSError):
+            self._closing.close()
 
     # --- the event loop --------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ import selectors
 import socket
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from softfinger.kinematics.compiled.own_folder import require_own
 LINKS = ("servos", "tactile-left", "tactile-right")
 _LOCK = ".emulator.lock"
 _CONTROL = "control"
+_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _MESSAGE_SIZE_MAX = 4096  # bytes per message
 _REPLY_SIZE_MAX = 1 << 17
 _CLIENT_COUNT_MAX = 8  # maximum number of connected clients
@@ -46,7 +47,7 @@ class LinkFolder:
     def __init__(self, path: Path) -> None:
         """Create and lock the folder. Raises FolderError if the folder is in use or unusable."""
         self.path = path
-        self._links: dict[Path, str] = {}
+        self._targets: dict[str, str] = {}  # target of each link
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             require_own(path)
@@ -87,19 +88,19 @@ class LinkFolder:
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(target)
         fresh.replace(link)
-        self._links[link] = target
+        self._targets[name] = target
 
     def unlink(self, name: str) -> None:
         """Remove the link ``name``, unless its target has changed."""
-        target = self._links.pop(self.path / name, "")
+        target = self._targets.pop(name, "")
         with contextlib.suppress(OSError):
             if str((self.path / name).readlink()) == target:
                 (self.path / name).unlink()
 
     def close(self) -> None:
         """Remove the lock and all links whose targets have not changed."""
-        for link in list(self._links):
-            self.unlink(link.name)
+        for name in list(self._targets):
+            self.unlink(name)
         with contextlib.suppress(OSError):
             (self.path / _LOCK).unlink()
         with contextlib.suppress(OSError):
@@ -130,7 +131,7 @@ class ControlPort:
         """
         self._handle = handle
         self._selector = selector
-        self._folder = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        self._folder = os.open(folder, _DIRECTORY)
         self._clients: list[socket.socket] = []
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
@@ -220,27 +221,20 @@ def send_words(folder: Path, text: str) -> str:
         If no emulator is running in the folder, or if the emulator does not reply.
     """
     try:
-        with _directory(folder) as descriptor:
+        with contextlib.ExitStack() as opened:
+            descriptor = os.open(folder, _DIRECTORY)
+            opened.callback(os.close, descriptor)
             client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            with client:
-                client.settimeout(_CLIENT_TIMEOUT)
-                client.connect(_address(descriptor))
-                client.send(text.encode())
-                reply = client.recv(_REPLY_SIZE_MAX)
+            opened.enter_context(client)
+            client.settimeout(_CLIENT_TIMEOUT)
+            client.connect(_address(descriptor))
+            client.send(text.encode())
+            reply = client.recv(_REPLY_SIZE_MAX)
     except OSError:
         raise NoEmulator(f"{folder}: no emulator is running here") from None
     if not reply:
         raise NoEmulator(f"{folder}: the emulator has exited")
     return reply.decode()
-
-
-@contextlib.contextmanager
-def _directory(folder: Path) -> Iterator[int]:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
 
 
 def _address(folder: int) -> str:

@@ -142,9 +142,8 @@ class Plate:
     def __init__(self) -> None:
         self._t = [0.0]
         self._d = [-_CLEARANCE]
-        self._doing: list[tuple[PlatePress | None, bool]] = [
-            (None, False)
-        ]  # press of each interval, and whether the plate is stationary
+        # Press of each interval, and whether the plate is stationary.
+        self._doing: list[tuple[PlatePress | None, bool]] = [(None, False)]
         self._reported = -1
         self.arrives = 0.0  # time at which the plate reaches the last press
 

@@ -14,7 +14,6 @@ import math
 import os
 import pty
 import struct
-import time
 import tty
 from collections.abc import Callable
 
@@ -37,54 +36,13 @@ PASSAGE_TIME = 15e-6
 _LAG_TIME = 0.0005
 
 
-def open_pty() -> tuple[int, int, str]:
-    """Open a pty and return its non-blocking master, its raw slave, and the path of the slave.
+class PtyPort:
+    """Pseudo-terminal at ``path``, which can be unplugged and plugged in again.
 
     The slave stays open in this process, so clients can connect and disconnect without errors.
     """
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    os.set_blocking(master, False)
-    return master, slave, os.ttyname(slave)
 
-
-class PtyServoBus:
-    """Servo bus on a new pseudo-terminal at ``path``.
-
-    The caller must call :meth:`service` when :meth:`fileno` is readable, and at the time that
-    :meth:`next_event` returns.
-
-    Parameters
-    ----------
-    bus
-        Emulated servos.
-    baud
-        If 0, servos reply immediately at any rate. Otherwise, servos ignore clients that use
-        another rate, and replies are delayed by their transmission time.
-    spin
-        Duration [s] of busy waiting before a paced reply is due, because sleeps end late.
-    clock
-        Clock for all times.
-    """
-
-    def __init__(
-        self,
-        bus: ServoBus,
-        *,
-        baud: int = 0,
-        spin: float = 0.00012,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.bus = bus
-        bus.parser.gap = _GAP_TIME
-        bus.lag = _LAG_TIME
-        self._baud = baud
-        self._spin = spin
-        self._clock = clock
-        self._free_at = -math.inf  # time at which the wire becomes free
-        self._due: list[tuple[float, int, bytes]] = []
-        self._order = 0
-        self._arrives = -math.inf  # arrival time of the last reply
+    def __init__(self) -> None:
         self.plug()
 
     def fileno(self) -> int:
@@ -98,23 +56,74 @@ class PtyServoBus:
 
     def plug(self) -> None:
         """Create or recreate the terminal at a new ``path``."""
-        self._master, self._slave, self.path = open_pty()
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
 
     def unplug(self) -> None:
-        """Remove the terminal, as if an adapter were unplugged, but keep the servos running."""
-        self._due.clear()
-        self.bus.parser.reset()
+        """Remove the terminal, which makes a client's reads fail, but keep the device running."""
         if self.plugged:
             os.close(self._master)
             os.close(self._slave)
         self._master = self._slave = -1
 
     def apply_fault(self, kind: str, value: float, t: float) -> None:
-        """Begin a fault of the port, line or servos; the kinds ``plug`` and ``well`` end faults."""
+        """Begin a fault of the port or device; the kinds ``plug`` and ``well`` end faults."""
         if kind == "unplug":
             self.unplug()
         elif kind in ("plug", WELL) and not self.plugged:
             self.plug()
+
+
+class PtyServoBus(PtyPort):
+    """Servo bus on a new pseudo-terminal.
+
+    The caller must call :meth:`service` when :meth:`fileno` is readable, and at the time that
+    :meth:`next_event` returns.
+
+    Parameters
+    ----------
+    bus
+        Emulated servos.
+    baud
+        If 0, servos reply immediately at any rate. Otherwise, servos ignore clients that use
+        another rate, and replies are delayed by their transmission time.
+    clock
+        Clock for all times.
+    spin
+        Duration [s] of busy waiting before a paced reply is due, because sleeps end late.
+    """
+
+    def __init__(
+        self,
+        bus: ServoBus,
+        *,
+        baud: int,
+        clock: Callable[[], float],
+        spin: float = 0.00012,
+    ) -> None:
+        self.bus = bus
+        bus.parser.gap = _GAP_TIME
+        bus.lag = _LAG_TIME
+        self._baud = baud
+        self._spin = spin
+        self._clock = clock
+        self._free_at = -math.inf  # time at which the wire becomes free
+        self._due: list[tuple[float, int, bytes]] = []
+        self._order = 0
+        self.answering_until = -math.inf  # arrival time of the last reply without a fault's delay
+        super().__init__()
+
+    def unplug(self) -> None:
+        """Remove the terminal, as if an adapter were unplugged, but keep the servos running."""
+        self._due.clear()
+        self.bus.parser.reset()
+        super().unplug()
+
+    def apply_fault(self, kind: str, value: float, t: float) -> None:
+        """Begin a fault of the port, line or servos; the kinds ``plug`` and ``well`` end faults."""
+        super().apply_fault(kind, value, t)
         if kind == WELL:
             self.bus.recover(t)
         else:
@@ -128,13 +137,8 @@ class PtyServoBus:
 
     def next_event(self) -> float:
         """Return the latest time [s] at which :meth:`service` must be called."""
-        servos = self.bus.next_event()
+        servos = self.bus.due
         return min(servos, self._due[0][0] - self._spin) if self._due else servos
-
-    @property
-    def answering_until(self) -> float:
-        """Arrival time [s] of the last reply that was not delayed by a fault."""
-        return self._arrives
 
     def driven(self) -> bool:
         """Return True if torque is on and a process such as the daemon has locked the port."""
@@ -183,7 +187,7 @@ class PtyServoBus:
             due = free_at + reply.late
             self._queue(due - PASSAGE_TIME, reply.data)
             if not reply.late:
-                self._arrives = due
+                self.answering_until = due
         self._free_at = free_at
         return bool(replies)
 

@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.simulation.emulator.pty_bus import open_pty
+from softfinger.daemon.simulation.emulator.pty_bus import PtyPort
 from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.types import Frame
@@ -39,7 +39,7 @@ class FrameSource(Protocol):
         """Return the newest frame that is due, or None before the first frame."""
 
 
-class FrameWriter:
+class FrameWriter(PtyPort):
     """The board's end of a pty. Frames are sent completely or not at all.
 
     A pty buffers tens of kilobytes. If no client reads, frames are dropped long before this buffer
@@ -47,14 +47,14 @@ class FrameWriter:
     """
 
     def __init__(self) -> None:
-        self._master, self._slave, self.path = open_pty()
+        super().__init__()
         self.dropped = 0  # frames
-        self._remaining = b""  # unsent part of the last frame
         self._unread = array.array("i", [0])
 
-    def fileno(self) -> int:
-        """Return a file descriptor that is readable when the client has sent bytes; see `drain`."""
-        return self._master
+    def plug(self) -> None:
+        """Create or recreate the terminal at a new ``path``."""
+        super().plug()
+        self._remaining = b""  # unsent part of the last frame
 
     def send(self, frame: bytes) -> bool:
         """Write one frame, or drop it if the client has not read earlier frames."""
@@ -72,25 +72,12 @@ class FrameWriter:
                 self._remaining = self._remaining[os.write(self._master, self._remaining) :]
         return not self._remaining
 
-    def drain(self) -> bytes:
-        """Return the bytes sent by the client."""
-        try:
-            return os.read(self._master, _DRAIN)
-        except BlockingIOError:
-            return b""
-
-    def close(self) -> None:
-        """Close both ends of the pty; a client's next read then fails."""
-        for end in (self._master, self._slave):
-            with contextlib.suppress(OSError):
-                os.close(end)
-
     def _unread_bytes(self) -> int:
         fcntl.ioctl(self._slave, termios.FIONREAD, self._unread)
         return self._unread[0]
 
 
-class TactileBoard:
+class TactileBoard(FrameWriter):
     """Emulated board that sends each new frame from ``source`` over a pty.
 
     A board that waits for requests sends one frame per request. ``faults`` maps each active fault
@@ -116,6 +103,7 @@ class TactileBoard:
         seed: int = 1,
     ) -> None:
         """Create a board; frame k is due at k/rate + delay [s]. ``seed`` determines the faults."""
+        super().__init__()
         self._source = source
         self._encoder = encoder
         self._requested = not encoder.request
@@ -123,49 +111,25 @@ class TactileBoard:
         self._delay = delay
         self.faults: dict[str, float] = {}
         self._random = np.random.default_rng(seed)
-        self.plug()
         self._seq = -1
         self._frozen: NDArray[np.uint16] | None = None  # image that a frozen board repeats
         self._due = -math.inf
         self.sent = 0  # frames
 
-    def plug(self) -> None:
-        """Create or recreate the port at a new ``path``."""
-        self._writer = FrameWriter()
-        self.path = self._writer.path
-        self.plugged = True
-
-    def unplug(self) -> None:
-        """Remove the port, which makes a client's reads fail, but keep the board running."""
-        if self.plugged:
-            self._writer.close()
-        self.plugged = False
-
-    def apply_fault(self, kind: str, value: float, _t: float = 0.0) -> None:
+    def apply_fault(self, kind: str, value: float, t: float) -> None:
         """Begin a fault of the port or the board; the kinds ``plug`` and ``well`` end faults."""
-        if kind == "unplug":
-            self.unplug()
-        elif kind in ("plug", WELL) and not self.plugged:
-            self.plug()
+        super().apply_fault(kind, value, t)
         if kind == WELL:
             self.faults.clear()
         elif kind in BOARD_FAULTS:
             self.faults[kind] = value
 
-    @property
-    def dropped(self) -> int:
-        """Number of frames dropped because no client read the frames in time."""
-        return self._writer.dropped
-
-    def fileno(self) -> int:
-        """Return a file descriptor that becomes readable when :meth:`hear` must be called."""
-        return self._writer.fileno()
-
     def hear(self) -> None:
         """Read the bytes from the client, which may request a frame."""
-        written = self._writer.drain() if self.plugged else b""
-        if self._encoder.request and self._encoder.request in written:
-            self._requested = True
+        with contextlib.suppress(OSError):  # No bytes are available, or the port is unplugged.
+            written = os.read(self._master, _DRAIN)
+            if self._encoder.request and self._encoder.request in written:
+                self._requested = True
 
     def next_event(self) -> float:
         """Return the time [s] at which :meth:`service` must be called next."""
@@ -174,7 +138,7 @@ class TactileBoard:
     def service(self, t: float) -> None:
         """Send the newest frame if a new frame is due at time t [s]."""
         if self.plugged:
-            self._writer.flush()
+            self.flush()
         # Adding 1e-6 prevents rounding errors from making the same frame due twice.
         self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
         self._due += self._delay
@@ -188,10 +152,7 @@ class TactileBoard:
         data = self._spoil(frame)
         if data:
             self._requested = not self._encoder.request
-            self.sent += self._writer.send(data)
-
-    def close(self) -> None:
-        self.unplug()
+            self.sent += self.send(data)
 
     def _spoil(self, frame: Frame) -> bytes:
         counts, faults = frame.data, self.faults

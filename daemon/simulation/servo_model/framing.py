@@ -82,14 +82,6 @@ class Packet(NamedTuple):
     instruction: int
     parameters: bytes
     valid: bool
-    size: int  # bytes on the wire
-
-
-def _packet(raw: bytes) -> Packet:
-    """Decode the complete packet ``raw``."""
-    valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
-    body = raw[7:-2].replace(_STUFFED, HEADER)
-    return Packet(raw[4], body[0], body[1:], valid, len(raw))
 
 
 class PacketParser:
@@ -150,4 +142,6 @@ class PacketParser:
                 return None
             raw = bytes(buffer[:end])
             del buffer[:end]
-            return _packet(raw)
+            body = raw[7:-2].replace(_STUFFED, HEADER)
+            valid = crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
+            return Packet(packet_id, body[0], body[1:], valid)

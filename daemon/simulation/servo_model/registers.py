@@ -47,11 +47,6 @@ class Item:
     high: int = 0
     signed: bool = False
 
-    @property
-    def saved(self) -> bool:
-        """True for EEPROM registers."""
-        return self.address < reg.RAM
-
 
 def _read_only(address: int, size: int, default: int = 0, signed: bool = False) -> Item:
     return Item(address, size, default=default, signed=signed)
@@ -143,13 +138,12 @@ class ControlTable:
     """
 
     def __init__(self, model: ServoModel, firmware: int) -> None:
-        self.items = _items_of(model, firmware)
+        self.at = {item.address: item for item in _items_of(model, firmware)}
         self.size = model.highest_address(firmware) + 1
         self.memory = bytearray(self.size)
-        self.at = {item.address: item for item in self.items}
         self._modes = model.modes
         self._unpack = {}
-        for item in self.items:
+        for item in self.at.values():
             form = _FORMATS[item.size]
             layout = struct.Struct(form.lower() if item.signed else form)
             self._unpack[item.address] = layout.unpack_from
@@ -178,7 +172,7 @@ class ControlTable:
 
         If ``first`` is `control_table.RAM`, the reset has the same effect as a power-up.
         """
-        for item in self.items:
+        for item in self.at.values():
             if item.address >= first and item.address not in keep:
                 self.set(item.address, item.default)
 
@@ -239,7 +233,7 @@ class ControlTable:
             if memory[reg.BUS_WATCHDOG] == reg.WATCHDOG_ERROR:
                 return framing.DATA_RANGE
             return framing.OK if self._within_limit(address, value) else framing.DATA_LIMIT
-        if item.saved and memory[reg.TORQUE_ENABLE]:
+        if address < reg.RAM and memory[reg.TORQUE_ENABLE]:
             return framing.ACCESS
         if address == reg.OPERATING_MODE and value not in self._modes:
             return framing.DATA_RANGE

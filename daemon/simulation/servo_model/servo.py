@@ -155,21 +155,20 @@ class EmulatedServo:
     def heard(self, t: float) -> None:
         """Restart the bus watchdog because an instruction packet has arrived on the bus."""
         self._watched = t
-        self.recorder.heard(t, self._memory[reg.TORQUE_ENABLE] != 0)
+        self.recorder.heard(t, self.torque_on)
 
     def next_event(self) -> float:
         """Return the time [s] at which :meth:`act` must be called next."""
-        due = min(self._next_step, self._next_sense)
         if self._boot_at > -math.inf:
-            return min(due, self._boot_at)
+            return self._boot_at
+        due = min(self._next_step, self._next_sense)
         return min(due, self._watched + self.watchdog) if self._armed else due
 
     def act(self, t: float) -> None:
         """Handle events due at time t; the plant must already have been advanced to t."""
+        if t < self._boot_at:
+            return
         if self._boot_at > -math.inf:
-            if t < self._boot_at:
-                self._next_sense = max(self._next_sense, self._boot_at)
-                return
             self._boot_at = -math.inf
             self._start(t)
         if self._armed and t >= self._watched + self.watchdog:
@@ -193,9 +192,9 @@ class EmulatedServo:
         table = self.table
         if self.refuses or not table.holds(address, length):
             return None
-        if self.frozen:
-            return table.read(address, length)
-        if table.reads(address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE):
+        if not self.frozen and table.reads(
+            address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE
+        ):
             self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
         return table.read(address, length)
 
@@ -206,15 +205,14 @@ class EmulatedServo:
         self.recorder.goals(values, self._joint, self.torque_on, error != framing.OK)
         if error:
             return error
-        limp = not self._memory[reg.TORQUE_ENABLE]
+        was_on = self.torque_on
         for item, value in plan:
             self.table.set(item.address, value)
         for item, value in plan:
             self._effect(item.address, value, t)
-        torque = self._memory[reg.TORQUE_ENABLE]
-        if torque and self._joint.moves_by_itself():
+        if self.torque_on and self._joint.moves_by_itself():
             self._next_step = min(self._next_step, t + STEP_TIME)
-        if limp and torque:
+        if self.torque_on and not was_on:
             goal = self.table.get(reg.GOAL_POSITION)
             self.recorder.torque_on(t, self._joint, self.mode, goal)
         self._joint.drive()
@@ -240,9 +238,7 @@ class EmulatedServo:
         """Switch torque off and restart after REBOOT_TIME with the default RAM values."""
         self.table.set(reg.TORQUE_ENABLE, 0)
         self._joint.drive()
-        self._next_step = math.inf
         self._boot_at = t + REBOOT_TIME
-        self._next_sense = self._boot_at
 
     def factory_reset(self, option: bytes, t: float) -> int:
         """Restore the factory defaults, then reboot.
@@ -299,7 +295,7 @@ class EmulatedServo:
             case "overheat":
                 self.health.heat.warm(self.table.get(reg.TEMPERATURE_LIMIT) + 5.0)
             case "overload":
-                self._fail(5)
+                self._fail(reg.OVERLOAD)
             case "undervoltage":
                 self.health.supply = (self.model.voltage_min - 10) * reg.VOLTAGE_UNIT
             case "stuck":
@@ -336,7 +332,7 @@ class EmulatedServo:
 
     def _reset_mode(self) -> None:
         table = self.table
-        for item in table.items:
+        for item in table.at.values():
             if reg.VELOCITY_I_GAIN <= item.address <= reg.FEEDFORWARD_1ST_GAIN:
                 table.set(item.address, item.default)
         table.set(reg.PROFILE_ACCELERATION, 0)
@@ -358,7 +354,7 @@ class EmulatedServo:
         """Start up after power-up or reboot."""
         table = self.table
         table.reset(first=reg.RAM)
-        self.health.restart()
+        self.health.overload = 0.0
         self._booted = self._watched = t
         self._joint.forget_turns()
         self._registered = None

@@ -17,6 +17,7 @@ from itertools import zip_longest
 from operator import and_
 from typing import Any, NamedTuple
 
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
@@ -69,8 +70,8 @@ class ServoBus:
         self.parser = PacketParser()
         self.lag = 0.0  # maximum age of a reading at the time of the reply [s]
         self.packets = 0  # number of packets received
-        self._now = -math.inf
-        self._due = -math.inf  # lower bound on the time of the next servo event
+        self.now = -math.inf  # time to which the bus has been advanced [s]
+        self.due = -math.inf  # lower bound on the time of the next servo event [s]
 
     @classmethod
     def from_settings(
@@ -86,14 +87,14 @@ class ServoBus:
         """Create the configured servos, one per joint, starting with the left finger.
 
         ``ids`` replaces the IDs in the settings, and a ``baud`` above 0 replaces the baud rate. If
-        ``factory`` is True, all other registers have their factory defaults. Raises ValueError if
-        the model does not support the baud rate.
+        ``factory`` is True, all other registers have their factory defaults. Raises SettingsError
+        if the model does not support the baud rate.
         """
         servos = settings.servos
         model = by_name(servos.model)
         rate = baud or servos.baud
         if rate not in model.baud_rates:
-            raise ValueError(
+            raise SettingsError(
                 f"{model.name} does not support {rate} baud, only "
                 f"{', '.join(map(str, model.baud_rates))}"
             )
@@ -110,28 +111,19 @@ class ServoBus:
 
     # --- time ------------------------------------------------------------------------------
 
-    @property
-    def now(self) -> float:
-        """Time to which the bus has been advanced [s]."""
-        return self._now
-
     def advance(self, t: float) -> None:
         """Advance the plant and servos to time t [s], and handle each servo event at its time."""
-        if t <= self._now:
+        if t <= self.now:
             return
-        if t >= self._due:
+        if t >= self.due:
             servos, plant = self.servos, self.plant
             while (due := min(servo.next_event() for servo in servos)) <= t:
                 plant.advance(due)
                 for servo in servos:
                     servo.act(due)
-            self._due = due
+            self.due = due
         self.plant.advance(t)
-        self._now = t
-
-    def next_event(self) -> float:
-        """Return a lower bound [s] on the time of the next servo event."""
-        return self._due
+        self.now = t
 
     # --- bytes -----------------------------------------------------------------------------
 
@@ -141,15 +133,14 @@ class ServoBus:
 
     def exchange(self, data: bytes, t: float, baud: int = 0) -> list[TimedReply]:
         """Return the replies to ``data`` with their delays. A ``baud`` of 0 matches all servos."""
-        if t >= self._due or t > self._now + self.lag:
+        if t >= self.due or t > self.now + self.lag:
             self.advance(t)
         replies: list[TimedReply] = []
         for asked in framing.old_pings(data):
             replies += [
                 TimedReply(servo.return_delay, framing.old_status(servo.id))
-                for servo in self.servos
-                if servo.old_protocol and servo.awake(t) and asked in (servo.id, BROADCAST)
-                if not baud or baud == servo.baud
+                for servo in self._listening(t, baud, old_protocol=True)
+                if asked in (servo.id, BROADCAST)
             ]
         for packet in self.parser.feed(data, t):
             self.packets += 1
@@ -158,15 +149,12 @@ class ServoBus:
                 continue
             if not reads:
                 self.advance(t)
-            listening = []
-            for servo in self.servos:
-                heard = not servo.old_protocol and (not baud or baud == servo.baud)
-                if servo.awake(t) and heard:
-                    servo.heard(t)
-                    listening.append(servo)
+            listening = self._listening(t, baud)
+            for servo in listening:
+                servo.heard(t)
             replies += self._answers(packet, listening, t)
             if not reads:
-                self._due = min([servo.next_event() for servo in self.servos])
+                self.due = min([servo.next_event() for servo in self.servos])
         if not self.faults.active:
             return replies
         return [
@@ -175,9 +163,17 @@ class ServoBus:
             for late, spoilt in self.faults.spoil(reply.data)
         ]
 
+    def _listening(self, t: float, baud: int, old_protocol: bool = False) -> list[EmulatedServo]:
+        """Return the servos that receive packets of a protocol at a baud rate."""
+        return [
+            servo
+            for servo in self.servos
+            if servo.old_protocol == old_protocol and servo.awake(t) and baud in (0, servo.baud)
+        ]
+
     def fault(self, kind: str, value: float, t: float) -> None:
         """Start a fault; ``value`` is a probability for LINE_FAULTS and an ID for SERVO_FAULTS."""
-        self._due = -math.inf
+        self.due = -math.inf
         if kind in LINE_FAULTS:
             setattr(self.faults.rates, kind.replace("-", "_"), value)
         for servo in self.servos:
@@ -215,14 +211,11 @@ class ServoBus:
         replies = []
         for servo in servos:
             if servo.id == packet.id:
-                # The reply uses the return level, delay and ID from before the instruction.
+                # The return level from before the instruction applies.
                 level = servo.table.get(reg.STATUS_RETURN_LEVEL)
-                delay, name = servo.return_delay, servo.id
-                error, data = _execute(servo, instruction, packet.parameters, t)
+                reply = _reply(servo, instruction, packet.parameters, t)
                 if level >= needed:
-                    # The alert bit of the reply reflects the state after the instruction.
-                    status = framing.status(name, error | servo.alert, data)
-                    replies.append(TimedReply(delay, status))
+                    replies.append(reply)
             elif servo.shadow == packet.id:
                 _execute(servo, instruction, packet.parameters, t)
         return _at_once(replies)
@@ -233,8 +226,7 @@ class ServoBus:
             replies = []
             for servo_id in sorted({servo.id for servo in servos}):
                 same = [servo for servo in servos if servo.id == servo_id]
-                answers = [_status(each, *_execute(each, instruction, data, t)) for each in same]
-                replies += _at_once(answers)
+                replies += _at_once([_reply(servo, instruction, data, t) for servo in same])
             return replies
         if instruction in _GROUP_READS:
             return self._group_read(instruction, data, servos, t)
@@ -263,9 +255,7 @@ class ServoBus:
                 break
             if not fast:
                 span = _SPAN.pack(address, length)
-                replies += _at_once(
-                    [_status(servo, *_execute(servo, framing.READ, span, t)) for servo in same]
-                )
+                replies += _at_once([_reply(servo, framing.READ, span, t) for servo in same])
                 continue
             # Each CRC covers all preceding bytes, including earlier CRCs.
             (servo,) = same
@@ -329,8 +319,15 @@ def _bulk_items(data: bytes) -> Iterator[tuple[int, int, bytes]]:
             yield servo_id, address, data[i - length : i]
 
 
-def _status(servo: EmulatedServo, error: int, data: bytes = b"") -> TimedReply:
-    return TimedReply(servo.return_delay, framing.status(servo.id, error | servo.alert, data))
+def _reply(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> TimedReply:
+    """Execute an instruction on a servo; return the reply.
+
+    The reply uses the return delay and the ID from before the instruction, and the alert bit from
+    after the instruction.
+    """
+    delay, servo_id = servo.return_delay, servo.id
+    error, values = _execute(servo, instruction, data, t)
+    return TimedReply(delay, framing.status(servo_id, error | servo.alert, values))
 
 
 def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> tuple[int, bytes]:

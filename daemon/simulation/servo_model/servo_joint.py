@@ -161,20 +161,17 @@ class ServoJoint:
 
     def drive(self) -> None:
         """Drive the plant according to the registers."""
-        memory, table, joint = self._memory, self._table, self._joint
-        mode = memory[reg.OPERATING_MODE]
+        memory, table, drive = self._memory, self._table, self._plant.drive
+        mode, goal = memory[reg.OPERATING_MODE], self.goal_angle(self.profile.position)
         if not memory[reg.TORQUE_ENABLE]:
-            self._plant.drive(joint, reg.CURRENT_MODE, False, 0.0, 0.0)
+            drive(self._joint, reg.CURRENT_MODE, False, 0.0, 0.0)
         elif mode == reg.CURRENT_BASED_POSITION_MODE:
             bound = abs(table.get(reg.GOAL_CURRENT)) * self._model.current_unit
-            goal = self.goal_angle(self.profile.position)
-            self._plant.drive(joint, reg.CURRENT_BASED_POSITION_MODE, True, goal, bound)
+            drive(self._joint, mode, True, goal, bound)
         elif mode == reg.CURRENT_MODE:
-            current = self._scale.amperes(self.sign * table.get(reg.GOAL_CURRENT))
-            self._plant.drive(joint, reg.CURRENT_MODE, True, 0.0, current)
+            drive(self._joint, mode, True, 0.0, self.goal_current(table.get(reg.GOAL_CURRENT)))
         else:
-            goal = self.goal_angle(self.profile.position)
-            self._plant.drive(joint, reg.POSITION_MODE, True, goal, self.current_limit)
+            drive(self._joint, reg.POSITION_MODE, True, goal, self.current_limit)
 
     def refresh(self, seconds: float, voltage: float, temperature: float) -> None:
         """Update registers 120 to 146 at the time ``seconds`` after power-up."""
@@ -262,8 +259,6 @@ class Profile:
     def step(self, dt: float) -> None:
         """Advance by dt [s] on a trapezoidal profile that does not overshoot."""
         distance = self.target - self.position
-        if distance == 0.0 and self.velocity == 0.0:
-            return
         if abs(distance) < _ARRIVAL_TOLERANCE and abs(self.velocity) <= max(
             self.acceleration * dt, _ARRIVAL_TOLERANCE
         ):
@@ -312,12 +307,8 @@ class ServoHeat:
         simulation = settings.simulation
         heat = cls(by_name(settings.servos.model), *simulation.servo_heat)
         heat.ambient = simulation.ambient
-        heat.cool()
+        heat.warm(heat.ambient)
         return heat
-
-    def cool(self) -> None:
-        """Set all temperatures to the ambient temperature."""
-        self.winding = self.case = self.sensed = self.ambient
 
     def warm(self, temperature: float) -> None:
         """Set all temperatures to ``temperature`` [°C]."""
@@ -347,23 +338,19 @@ class ServoHealth:
     def __init__(self, model: ServoModel, heat: ServoHeat | None = None) -> None:
         self._model = model
         self.heat = ServoHeat(model) if heat is None else heat
-        self._overload = 0.0  # s
+        self.overload = 0.0  # time at the current limit [s]
         self._current = 0.0  # A
         self.recover()
 
     def recover(self) -> None:
         """Cool the motor to ambient temperature and restore the supply voltage."""
-        self.heat.cool()
+        self.heat.warm(self.heat.ambient)
         self.supply = self._model.supply
 
     @property
     def voltage(self) -> float:
         """Supply voltage [V] at the present servo current."""
         return self.supply - reg.SAG * self._current
-
-    def restart(self) -> None:
-        """Restart as if after a power-up, but keep the temperatures."""
-        self._overload = 0.0
 
     def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
         """Advance by SENSE_INTERVAL and return the bits of all active hardware errors.
@@ -372,13 +359,13 @@ class ServoHealth:
         """
         self._current = abs(current)
         self.heat.step(current, SENSE_INTERVAL)
-        self._overload = self._overload + SENSE_INTERVAL if pressed else 0.0
+        self.overload = self.overload + SENSE_INTERVAL if pressed else 0.0
         errors = []
         if self.heat.sensed > table.get(reg.TEMPERATURE_LIMIT):
             errors.append(reg.OVERHEATING)
         low, high = table.get(reg.MIN_VOLTAGE_LIMIT), table.get(reg.MAX_VOLTAGE_LIMIT)
         if not low <= round(self.voltage / reg.VOLTAGE_UNIT) <= high:
             errors.append(_VOLTAGE)
-        if self._overload >= OVERLOAD_TIME:
+        if self.overload >= OVERLOAD_TIME:
             errors.append(reg.OVERLOAD)
         return errors
