@@ -80,7 +80,7 @@ class Loop:
         grasp, sensors = perception.filter.grasp, perception.fingers
         self._control = Control(settings, self.state, grasp)
         self._task = Task.named(settings)
-        self._safety = Safety(settings, servos is not None, bool(sensors), grasp, sensors)
+        self._safety = Safety(settings, grasp, sensors)
         self._heat = HeatWatch(settings, self.state)
         self.torque = TorqueState(
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
