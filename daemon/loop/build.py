@@ -97,8 +97,9 @@ class Daemon:
         for each in perception.fingers:
             self._closers.append(each.sensor.close)
             each.sensor.open()
-        self.loop = Loop(settings, self.clock, self.servos, perception, publisher, server, on_event)
-        self.loop.publish_truth(self.hand)
+        self.loop = Loop(
+            settings, self.clock, self.servos, perception, publisher, server, on_event, self.hand
+        )
         if publisher is not None:
             publisher.settings(
                 self.clock.wall(), self.clock.now(), hand_info(settings, self.models)

@@ -68,6 +68,7 @@ class Loop:
         publisher: Publisher | None,
         server: Commands | None,
         on_event: EventSink | None = None,
+        truth: Truth | None = None,
     ) -> None:
         self.state = State(t=clock.now(), wall=clock.wall())
         self.period = 1.0 / settings.loop.rate
@@ -100,7 +101,7 @@ class Loop:
         self._lateness = Lateness(settings, self.state.timing, clock.pauses_when_late)
         self._publishing = None
         if publisher is not None:
-            self._publishing = Publishing(settings, publisher, sensors, self.statistics)
+            self._publishing = Publishing(settings, publisher, sensors, self.statistics, truth)
         self.heartbeat: Callable[[float], None] | None = None  # called with each tick's end time
         self._reports: deque[tuple[str, str, str]] = deque()  # events reported outside a tick
         self._ending = False
@@ -121,11 +122,6 @@ class Loop:
     def report(self, level: str, kind: str, text: str) -> None:
         """Emit an event on the next tick. This method is thread-safe."""
         self._reports.append((level, kind, text))
-
-    def publish_truth(self, truth: Truth | None) -> None:
-        """Publish the true state of a simulated hand to subscribers of ``hand/truth``."""
-        if self._publishing is not None:
-            self._publishing.truth = truth
 
     # Time
 
@@ -247,7 +243,7 @@ class Loop:
             self._requests.watch_silence()
         state.mode = control.mode
         self._react(self._safety.judge(state))
-        if self._heat.due and (action := self._heat.act(control, control.events)):
+        if self._heat.due and (action := self._heat.act(control)):
             self._requests.end_grip(action)
         if self._safety.must_hold and state.mode in GRIPPING_MODES:
             control.hold_goal(state.goal)

@@ -17,7 +17,7 @@ from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.types import FINGERS, Event, State
+from softfinger.daemon.types import FINGERS, State
 from softfinger.kinematics.hand.servo_heat import (
     AMBIENT,
     CASE,
@@ -118,7 +118,7 @@ class HeatWatch:
             limit = self._limits.temperature_max - _HALF_STEP
             estimate.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
-    def act(self, control: Control, events: list[Event]) -> str:
+    def act(self, control: Control) -> str:
         """Reduce the grip force if a servo is about to overheat.
 
         Return ``heat_action`` if the action is due, otherwise "".
@@ -146,7 +146,7 @@ class HeatWatch:
             self._reduction_time = state.t
             control.limit_force(eased, _ACTION_TIME)
             text = f"{who}: the grip force was reduced from {now:.1f} to {eased:.1f} N"
-            events.append(("warning", "servos.heat", text))
+            control.events.append(("warning", "servos.heat", text))
             return ""
         if left > _ERROR_TIME:
             return ""
@@ -157,5 +157,5 @@ class HeatWatch:
                 f"{who}, and the load does not allow a lower grip force; safety.heat_action = "
                 f"{action}"
             )
-            events.append(("error", "servos.heat", text))
+            control.events.append(("error", "servos.heat", text))
         return action if left < _ACTION_TIME and action != "hold" else ""

@@ -225,7 +225,7 @@ def test_plain_and_json_log_lines_have_the_same_content(tmp_path):
         log.take_over_logging()
         handler = logging.getLogger().handlers[-1]
         log.line("warning", "servos.temperature", 'left "servo"\nat 61 °C')
-        log.plain("softfinger: ended", "error")
+        log.line("error", "", "softfinger: ended")
         logging.getLogger("softfinger.daemon.servos.dynamixel").error("port %s is gone", "x")
         log.close()
         logging.getLogger().removeHandler(handler)
@@ -250,7 +250,7 @@ def test_journal_lines_have_priorities(capfd, monkeypatch):
     for form in ("plain", "json"):
         log = EventLog(form)
         log.line("warning", "bus", "slow\nand late", late_s=0.25)
-        log.plain("softfinger: exited with a fault", "error")
+        log.line("error", "", "softfinger: exited with a fault")
         log.close()
     *plain, line, last = capfd.readouterr().err.splitlines()
     ended = "<3>softfinger: exited with a fault"

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from softfinger.daemon.loop.warm_up import (
     ALL,
@@ -51,25 +51,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compile the missing kernels. Return 1 if a kernel could not be compiled.
+    """Compile the missing kernels. Return 1 if a kernel could not be compiled or stored.
 
     Raises
     ------
     SettingsError
     """
-    built = build_kernels(profile(arguments), print_event, ALL if arguments.all else None)
-    if built.failed:
+    if not build_kernels(profile(arguments), print_event, ALL if arguments.all else None):
         return 1
-    if not built.parts:
-        print("all kernels are compiled")
+    print("all kernels are compiled")
     return 0
-
-
-class Built(NamedTuple):
-    """Number of parts that were missing, and True if any of these parts could not be built."""
-
-    parts: int
-    failed: bool
 
 
 def print_event(_level: str, _kind: str, text: str) -> None:
@@ -79,13 +70,13 @@ def print_event(_level: str, _kind: str, text: str) -> None:
 
 def build_kernels(
     settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
-) -> Built:
+) -> bool:
     """Build the missing parts in ``wanted``, or all missing parts of the scene by default.
 
-    If all parts exist, the function returns quickly without a message. If standard error is a
-    terminal and ``bar`` is set, a bar shows the progress. Without a bar, ``tell(level, kind,
-    text)`` is called for each part. Failures are also passed to ``tell``. An interrupt ends all
-    processes.
+    Return False if a part could not be built or stored. If all parts exist, the function returns
+    quickly without a message. If standard error is a terminal and ``bar`` is set, a bar shows the
+    progress. Without a bar, ``tell(level, kind, text)`` is called for each part. Failures are also
+    passed to ``tell``. An interrupt ends all processes.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
@@ -93,14 +84,14 @@ def build_kernels(
         tell("warning", "compile", text)
     missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
-        return Built(0, False)
+        return True
     if folder is None:
-        tell(
-            "warning",
-            "compile",
-            "compiling the kernels in this process, which takes about half a minute",
+        text = (
+            "the kernels can't be stored, so each process compiles the kernels that it uses, which "
+            "takes about half a minute"
         )
-        return Built(0, False)
+        tell("warning", "compile", text)
+        return False
     if why_plain:
         tell(
             "info", "compile", f"compiling with Numba alone, which takes twice as long: {why_plain}"
@@ -112,7 +103,7 @@ def build_kernels(
     build.run()
     if not build.failed:
         tell("info", "compile", f"compiled in {time.monotonic() - started:.1f} s")
-    return Built(len(missing), build.failed)
+    return not build.failed
 
 
 def _available() -> float:
