@@ -313,7 +313,7 @@ class Loop:
         self._publish_command(request, "")
         self._commanded = True
         if name == "clear":
-            self._latch("", "")
+            self.state.fault = self.state.fault_name = ""
         if self._task is not None and not by_task:
             self._end_task(f"the command {name} was received")
         if name == "demo":
@@ -355,17 +355,11 @@ class Loop:
         return self._lateness.with_cause(name, text, at_work)
 
     def _fail(self, reason: str, name: str = BUS) -> None:
+        """Latch a fault, unless another fault is latched."""
         if not self.state.fault:
             if name == BUS:
                 reason = self._with_cause(name, reason)
-            self._latch(reason, name)
+            self.state.fault, self.state.fault_name = reason, name
             self._control.fail(reason, name)
             self._emit_events()
             self.state.mode = self._control.mode
-
-    def _latch(self, reason: str, name: str) -> None:
-        """Latch a fault, or clear the latched fault if ``reason`` is empty.
-
-        Only this method changes the fault.
-        """
-        self.state.fault, self.state.fault_name = reason, name

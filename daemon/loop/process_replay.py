@@ -34,10 +34,8 @@ class ProcessReplay:
         self._clock = _Clock()
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None
-        self._sensors: dict[int, GivenFrames] = {}
-        if settings.tactile.backend != "none":
-            for name in settings.scene.fingers:
-                self._sensors[FINGERS.index(name)] = GivenFrames()
+        sensing = [] if settings.tactile.backend == "none" else settings.scene.indices
+        self._sensors = {finger: GivenFrames() for finger in sensing}
         self._loop = Loop(
             settings,
             self._clock,

@@ -42,11 +42,6 @@ class FingerModel:
     calibration: Calibration | None
     prior: Prior
 
-    @property
-    def own_material(self) -> bool:
-        """True if the tip's stress-strain law comes from a calibration file."""
-        return self.calibration is not None and self.calibration.modulus is not None
-
 
 def make_models(
     settings: Settings, on_event: Callable[[str, str, str], None] | None = None

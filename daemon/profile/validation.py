@@ -226,7 +226,7 @@ def device_ports(settings: Settings) -> list[tuple[str, str]]:
     if servos.metal and not servos.source:
         ports.append(("servos.port", settings.servos.port))
     if tactile.metal and not tactile.source:
-        for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+        for finger in settings.scene.indices:
             ports.append((f"tactile.port ({FINGERS[finger]})", settings.tactile.port[finger]))
     return ports
 

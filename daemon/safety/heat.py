@@ -70,7 +70,7 @@ class HeatWatch:
         """Create a monitor that reads ``state.reading`` and updates ``state.heat``."""
         self._limits = settings.safety
         self._state = state
-        self._fingers = [FINGERS.index(name) for name in sorted(settings.scene.fingers)]
+        self._fingers = settings.scene.indices
         self._states = [HeatState(), HeatState()]
         if settings.servos.backend != "none":
             for each in self._states:

@@ -112,7 +112,7 @@ class View:
     ) -> None:
         self.settings = settings
         self.limits = settings.safety
-        self.fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
+        self.fingers = settings.scene.indices
         self.grasp = grasp
         self.sensors = sensors
         self.wiring = WiringWatch(self.fingers)

@@ -29,10 +29,14 @@ def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
         daemon.loop.advance(0.01)
 
 
-def grasped(daemon: Daemon, force: float) -> Daemon:
+def armed(daemon: Daemon) -> Daemon:
     command(daemon, "arm")
     daemon.loop.advance(0.1)
-    command(daemon, "grasp", force=force)
+    return daemon
+
+
+def grasped(daemon: Daemon, force: float) -> Daemon:
+    command(armed(daemon), "grasp", force=force)
     advance_to(daemon, "holding", 3.0)
     return daemon
 

@@ -16,6 +16,7 @@ from tests.harness.golden_wire import message_maker
 from tests.harness.loop import (
     Make,
     advance_to,
+    armed,
     change_frames,
     command,
     grasped,
@@ -164,10 +165,8 @@ def test_tare_is_refused_during_contact(make):
 
 
 def test_the_state_contains_the_goals_of_the_grip(make):
-    daemon = make()
+    daemon = armed(make())
     goal = daemon.loop.state.goal
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
     assert math.isnan(goal.force)
     command(daemon, "grasp", force=8.0)
     daemon.loop.advance(0.01)
@@ -377,8 +376,7 @@ def test_stop_works_in_every_mode_within_one_tick(make):
             loop.advance(loop.period)
             assert (state.mode, torque_of(daemon).any()) == ("disarmed", False), steps[upto - 1]
             loop.advance(0.5)
-    command(daemon, "arm")
-    loop.advance(0.1)
+    armed(daemon)
     assert command(daemon, "status")["limited"]["goal.slew"] > 0
     loop._fail("made up")
     loop.advance(loop.period)

@@ -32,7 +32,6 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import device_ports, plausibility_warnings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
-from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.compile import build_kernels, print_event
 
@@ -109,8 +108,7 @@ def results(
     if not backend("tactile", tactile.backend).metal:
         yield Finding("note", "tactile", f"{tactile.backend}: there is no board to check")
     else:
-        for name in settings.scene.fingers:
-            finger = FINGERS.index(name)
+        for finger in settings.scene.indices:
             if free.get(tactile.port[finger], True):
                 yield check_board(settings, finger)
             yield check_law(settings, finger)

@@ -47,7 +47,7 @@ _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#7777
 class Cell(NamedTuple):
     """Result of one grasp."""
 
-    outcome: str  # key in MEANING
+    outcome: str  # key in OUTCOME_TEXTS
     turned: float  # maximum object rotation [rad]
 
 
