@@ -19,7 +19,7 @@ from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.errors import ServosSilent
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
-from softfinger.daemon.loop.loop import EventSink, Loop
+from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.loop.warm_up import WantedScene, warm_up
 from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
@@ -27,7 +27,7 @@ from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
-from softfinger.daemon.types import HandInfo
+from softfinger.daemon.types import EventSink, HandInfo
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.loop_link import Link

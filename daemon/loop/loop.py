@@ -25,12 +25,10 @@ from softfinger.daemon.safety.heat import HeatWatch
 from softfinger.daemon.safety.safety import BUS, Breach, Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.types import State, Truth
+from softfinger.daemon.types import EventSink, State, Truth
 from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import Publisher
-
-EventSink = Callable[[str, str, str], None]
 
 # Maximum age of commands that switch torque on or move the hand [s]. A higher limit applies to
 # ``hold`` during a grip.

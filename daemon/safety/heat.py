@@ -137,9 +137,7 @@ class HeatWatch:
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
             return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
-        square = sustained_square(
-            self._states[i].array, self._limits.temperature_max - _TARGET_MARGIN
-        )
+        square = sustained_square(self._states[i].array, hot - _TARGET_MARGIN)
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))
         eased = max(min(lasts, now), _FRACTION_MIN * now, control.grip.force_for_load())
         if eased < _FRACTION_MAX * now:

@@ -181,8 +181,7 @@ class Safety:
                 return
             self._sent_q[i] = q[i]
             self._sent_current[i] = current[i]
-        if goal.valid:
-            servos.write(goal)
+        servos.write(goal)
 
     def _bound_goal(self, goal: Goal, i: int, low: float, high: float, present: float) -> None:
         q, current = goal.q[i], goal.current[i]

@@ -17,7 +17,7 @@ from softfinger.daemon.profile.settings import ServoSettings
 from softfinger.daemon.safety.safety import BUS, TORQUE_OFF, Safety
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
-from softfinger.daemon.types import Reading, State
+from softfinger.daemon.types import EventSink, Reading, State
 
 # Duration of repeated torque-off attempts, as a fraction of the watchdog time. After the attempts,
 # the bus is kept silent.
@@ -36,7 +36,7 @@ class TorqueState:
         state: State,
         safety: Safety,
         fail: Callable[[str, str], None],
-        emit: Callable[[str, str, str], None],
+        emit: EventSink,
     ) -> None:
         """Create the controller.
 

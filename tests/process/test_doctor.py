@@ -15,7 +15,6 @@ from unittest.mock import Mock
 import pytest
 
 from softfinger.daemon.diagnosis import devices, machine, ports
-from softfinger.daemon.diagnosis import machine as kernels
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
@@ -353,19 +352,19 @@ def test_missing_damaged_and_writable_kernel_files_cause_warnings(tmp_path, monk
     scene = Settings.model_validate({"servos": {"backend": "none"}, "tactile": {"backend": "none"}})
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(warm_up, "kernel_folder", find_kernel_folder)
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert found.status == "warn"
     assert "not compiled yet: contact table, joints and timing;" in found.text
     for part in warm_up.parts(scene):
         warm_up.mark_built(part, scene)
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert found.status == "pass"
     (folder,) = tmp_path.glob("kernels-*")
     (folder / "grip.kernel").write_bytes(b"torn")
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert (found.status, found.text[:17]) == ("warn", "found 1 corrupted")
     folder.chmod(0o777)
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert found.status == "warn"
     assert "other users can write to it" in found.text
     assert "NUMBA_CACHE_DIR" in found.fix

@@ -9,10 +9,7 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.types import Frame
-from softfinger.daemon.wire.schema import STATE
-from tests.harness.golden_wire import message_maker
 from tests.harness.loop import (
     Make,
     advance_to,
@@ -23,10 +20,9 @@ from tests.harness.loop import (
     heard,
     refusal,
     silence,
+    state_message,
     torque_of,
 )
-
-state_message = message_maker(STATE)
 
 
 def test_start_up_is_disarmed_without_torque_and_arming_causes_no_motion(make):
@@ -175,7 +171,7 @@ def test_the_state_contains_the_goals_of_the_grip(make):
     advance_to(daemon, "holding", 5.0)
     command(daemon, "rotate", angle=0.1)
     daemon.loop.advance(0.01)
-    message = state_message(daemon.loop.state, parts(daemon.settings))
+    message = state_message(daemon)
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
     advance_to(daemon, "holding", 5.0)
     daemon.loop.advance(1.0)

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,11 @@ from softfinger.daemon.loop.warm_up import (
     parts,
 )
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import EventSink
 from softfinger.kinematics.compiled.kernel import why_plain
 from softfinger.kinematics.compiled.kernel_folder import kernel_folder, remove_damaged
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.sweep import Progress, processors
-
-Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
 _MEMORY_MAX = 400e6  # upper bound on the memory use per process [bytes]
@@ -69,7 +68,7 @@ def print_event(_level: str, _kind: str, text: str) -> None:
 
 
 def build_kernels(
-    settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
+    settings: Settings, tell: EventSink, wanted: Sequence[Part] | None = None, bar: bool = True
 ) -> bool:
     """Build the missing parts in ``wanted``, or all missing parts of the scene by default.
 
@@ -118,7 +117,7 @@ def _available() -> float:
 class _Build:
     """Build pipeline parts in several processes, each controlled by its own thread."""
 
-    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: bool) -> None:
+    def __init__(self, settings: Settings, missing: list[Part], tell: EventSink, bar: bool) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
         self._at: dict[str, str] = {}  # for each part, the kernel that is being compiled
