@@ -25,6 +25,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.simulation.emulator.emulator import EmulatedServos
 from softfinger.kinematics.compiled.kernel_folder import find_kernel_folder
 from softfinger.tools.cli import main
@@ -311,6 +312,19 @@ def test_latency_timer_is_checked_and_repaired(tmp_path, monkeypatch):
     assert checks.check_latency_timer(path, 0.004, sysfs).status == "pass"
     assert devices.repair_latency_timer(path, sysfs) is None
     assert checks.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
+
+
+def test_a_board_at_the_unused_servo_port_is_not_checked_as_a_servo(tmp_path, monkeypatch):
+    board = ['tactile.backend="flexitac"', 'tactile.port=["/dev/ttyUSB0", ""]']
+    changes = ['servos.backend="none"', 'scene.fingers=["left"]', *board]
+    settings = load(changes=changes)
+    assert settings.servos.port == settings.tactile.port[0]
+    latency = Mock(return_value=None)
+    monkeypatch.setattr(doctor, "check_latency_timer", latency)
+    monkeypatch.setattr(doctor, "check_port", lambda path, *_: Finding("pass", path, "free"))
+    found = list(doctor.results(settings, False, save=tmp_path / "servos.json"))
+    latency.assert_called_once_with("/dev/ttyUSB0", 1.0)
+    assert [each.status for each in found if each.subject == "servos"] == ["note"]
 
 
 # Checks of the machine.

@@ -32,6 +32,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import device_ports, plausibility_warnings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
+from softfinger.daemon.types import FINGERS
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.processes.compile import build_kernels, print_event
 
@@ -92,16 +93,19 @@ def results(
     yield note_ports()
     yield check_runtime_folder()
     running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
-    free = {}
+    free = {}  # maps the settings key of each port to True if the port is free
     for key, path in ports:
         found = check_port(path, key, running)
-        free[path] = found.status == "pass"
+        free[key] = found.status == "pass"
         yield found
-        if free[path]:
-            yield from _latency(settings, path, fix)
-    if free.get(settings.servos.port):
+        if free[key]:
+            # A board sends frames unprompted, so the latency timer merely delays the frames. With a
+            # timeout of 1 s, every latency timer is acceptable.
+            timeout = settings.servos.reply_timeout if key == "servos.port" else 1.0
+            yield from _latency(path, timeout, fix)
+    if free.get("servos.port"):
         yield from _register_files(settings, save, restore)
-    yield from _servos(settings, free, fix)
+    yield from _servos(settings, free.get("servos.port", False), fix)
     for warning in plausibility_warnings(settings):
         yield Finding("warn", "settings", warning)
     tactile = settings.tactile
@@ -109,7 +113,7 @@ def results(
         yield Finding("note", "tactile", f"{tactile.backend}: there is no board to check")
     else:
         for finger in settings.scene.indices:
-            if free.get(tactile.port[finger], True):
+            if free.get(f"tactile.port ({FINGERS[finger]})", True):
                 yield check_board(settings, finger)
             yield check_law(settings, finger)
     yield from check_machine()
@@ -131,20 +135,17 @@ def _register_files(
         yield Finding("FAIL", "servos", str(error))
 
 
-def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
+def _latency(path: str, timeout: float, fix: bool) -> Iterator[Finding]:
     if fix:
         repaired = repair_latency_timer(path)
         if repaired is not None:
             yield repaired
-    servos = path == settings.servos.port
-    # A board sends frames unprompted, so the latency timer merely delays the frames. With a timeout
-    # of 1 s, every latency timer is acceptable.
-    found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
+    found = check_latency_timer(path, timeout)
     if found is not None:
         yield found
 
 
-def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Finding]:
+def _servos(settings: Settings, port_is_free: bool, fix: bool) -> Iterator[Finding]:
     servos = settings.servos
     found = backend("servos", servos.backend)
     if not found.metal:
@@ -157,7 +158,7 @@ def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Fi
         )
         yield Finding("note", "servos", text)
         return
-    if not free[servos.port]:
+    if not port_is_free:
         return
     if fix:
         yield from repair_servos(settings)
