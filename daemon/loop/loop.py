@@ -192,7 +192,7 @@ class Loop:
         self.perception.update(state)
         self._decide()
         decided = clock.host()
-        self.torque.write(self._control.torque, now)
+        self.torque.write(self._control.torque)
         written = clock.host()
         if self._publishing is not None:
             self._publishing(state)
@@ -214,7 +214,7 @@ class Loop:
         state, reading = self.state, self.state.reading
         state.read_error = state.write_error = ""
         try:
-            self.torque.read(reading)
+            self.torque.read()
         except ServoError as error:
             reading.valid = False
             state.read_error = str(error)
