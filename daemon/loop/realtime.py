@@ -283,11 +283,9 @@ class Service:
         self._due = t + self._every
         self._send(message)
 
-    def stopping(self) -> None:
-        """Report that shutdown has begun."""
-        self._send(b"STOPPING=1")
-
     def close(self) -> None:
+        """Report that shutdown has begun, and close the socket."""
+        self._send(b"STOPPING=1")
         self._socket.close()
 
     def _send(self, message: bytes) -> None:

@@ -59,11 +59,10 @@ def test_ready_is_sent_first_and_then_four_watchdog_messages_per_interval(manage
     service = Service(str(manager.path), watchdog=2.0)
     for tick in range(1000):  # 2 s
         service.alive(tick * 0.002)
-    service.stopping()
+    service.close()
     told = [manager.next() for _ in range(5)]
     assert told == [b"READY=1\nWATCHDOG=1", *[b"WATCHDOG=1"] * 3, b"STOPPING=1"]
     assert manager.quiet_for(0.0)
-    service.close()
 
 
 def test_a_missing_or_slow_manager_does_not_block_the_daemon(manager):

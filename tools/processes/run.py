@@ -176,7 +176,6 @@ def _service(loop: Any) -> Iterator[None]:
     try:
         yield
     finally:
-        service.stopping()
         service.close()
 
 
