@@ -72,9 +72,8 @@ class HeatWatch:
         self._state = state
         self._fingers = settings.scene.indices
         self._states = [HeatState(), HeatState()]
-        if settings.servos.backend != "none":
-            for each in self._states:
-                set_law(each.law, settings)
+        for each in self._states:
+            set_law(each.law, settings)
         self._heat = [0.0, 0.0]  # ∫ I² dt since the last update [A² s]
         self._square = [0.0, 0.0]  # low-pass filtered squared current [A²]
         self._t = math.nan  # time of the last reading [s]
@@ -124,12 +123,9 @@ class HeatWatch:
         Return ``heat_action`` if the action is due, otherwise "".
         """
         state = self._state
-        if state.mode not in GRIPPING_MODES:
-            self._error_reported = False
-            return ""
         i = min(self._fingers, key=lambda k: state.heat[k].time_to_limit)
         left = state.heat[i].time_to_limit
-        if left > self._limits.heat_warn:
+        if state.mode not in GRIPPING_MODES or left > self._limits.heat_warn:
             self._error_reported = False
             return ""
         hot = self._limits.temperature_max

@@ -129,12 +129,11 @@ class View:
         self._target = math.nan  # commanded grip force on the previous tick [N]
         self.rise_t = math.inf  # time of a commanded force increase that is not yet measured [s]
         self.rise_felt = 0.0  # measured force at `rise_t` [N]
-        low, high = settings.safety.voltage_min, settings.safety.voltage_max
-        if settings.servos.backend != "none":
-            model = by_name(settings.servos.model)
-            low = low or model.voltage_min * VOLTAGE_UNIT
-            high = high or model.voltage_max * VOLTAGE_UNIT
-        self.voltage = (low, high)
+        model = by_name(servos.model)
+        self.voltage = (
+            self.limits.voltage_min or model.voltage_min * VOLTAGE_UNIT,
+            self.limits.voltage_max or model.voltage_max * VOLTAGE_UNIT,
+        )
 
     def update(self, state: State) -> None:
         """Update the history with the state of the current tick."""

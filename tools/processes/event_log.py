@@ -27,7 +27,6 @@ from softfinger.daemon.own_files import write_text
 # dropped.
 _LINE_COUNT_MAX = 1000
 _PRIORITIES = {"error": "<3>", "warning": "<4>", "info": "<6>"}  # see sd-daemon(3)
-_LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
 
 
 class EventLog:
@@ -63,9 +62,7 @@ class EventLog:
 
     def take_over_logging(self) -> None:
         """Log the warnings and errors that any module sends to Python's logging."""
-        handler = _LogHandler(self)
-        handler.setLevel(logging.WARNING)
-        logging.getLogger().addHandler(handler)
+        logging.getLogger().addHandler(_LogHandler(self))
 
     def close(self, patience: float = 1.0) -> None:
         """Write the queued lines, and wait at most ``patience`` s until they are written."""
@@ -124,14 +121,14 @@ def _is_journal() -> bool:
 
 
 class _LogHandler(logging.Handler):
-    """Forward Python's logging to an event log."""
+    """Forward the warnings and errors of Python's logging to an event log."""
 
     def __init__(self, log: EventLog) -> None:
-        super().__init__()
+        super().__init__(logging.WARNING)
         self._log = log
 
     def emit(self, record: logging.LogRecord) -> None:
-        level = _LEVELS.get(record.levelno, "error")
+        level = "warning" if record.levelno < logging.ERROR else "error"
         try:
             self._log.line(level, record.name.rpartition(".")[2], record.getMessage())
         except Exception:  # A logging error must not stop the caller.
