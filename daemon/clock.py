@@ -13,7 +13,6 @@ from typing import Protocol
 
 from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS
 
 
 class Clock(Protocol):
@@ -62,7 +61,7 @@ def emulated(settings: Settings) -> bool:
     if backend("servos", settings.servos.backend).metal:
         ports.append(settings.servos.port)
     if backend("tactile", settings.tactile.backend).metal:
-        ports += [settings.tactile.port[FINGERS.index(name)] for name in settings.scene.fingers]
+        ports += [settings.tactile.port[finger] for finger in settings.scene.indices]
     # The emulator creates its port links and its control socket in the same folder.
     return bool(ports) and all(Path(port).with_name("control").is_socket() for port in ports)
 

@@ -23,8 +23,6 @@ from softfinger.kinematics.compiled.own_folder import (
 
 SIZE_MAX = 16 << 20  # maximum size of a file read in one piece, or of one unpacked part [bytes]
 
-_WORLD_WRITABLE = stat.S_IWOTH
-
 
 def open_regular(path: Path) -> BinaryIO:
     """Open a regular file for reading.
@@ -146,6 +144,6 @@ def _open(path: str, flags: int) -> int:
 def _refuse_foreign(path: str, found: os.stat_result) -> None:
     strange = HAS_OWNERS and found.st_uid not in (os.geteuid(), 0)
     link = stat.S_ISLNK(found.st_mode)
-    if strange and (link or Path(path).parent.stat().st_mode & _WORLD_WRITABLE):
+    if strange and (link or Path(path).parent.stat().st_mode & stat.S_IWOTH):
         what = "this link" if link else "this file in a world-writable folder"
         raise PermissionError(errno.EPERM, f"{what} is owned by another user", path)

@@ -9,6 +9,7 @@ the clock time in seconds.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -25,6 +26,7 @@ COMMAND_ADDRESS = "tcp://127.0.0.1:9873"
 NO_LEASE_COMMANDS = frozenset({"stop", "disarm", "status"})
 GRIP_FRACTION = 0.9  # maximum grip force as a fraction of `safety.force_max`
 Event = tuple[str, str, str]  # level, kind, text
+EventSink = Callable[[str, str, str], None]  # function that takes an event's level, kind and text
 
 
 def _pair() -> list[float]:

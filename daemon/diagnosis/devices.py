@@ -83,7 +83,7 @@ def check_servos(settings: Settings) -> list[Finding]:
 def _wait_for(line: ServoLine, settings: Settings) -> None:
     """Wait up to ``servos.open_timeout`` for missing servos, as `softfinger run` does."""
     end = time.monotonic() + settings.servos.open_timeout
-    missing = [settings.servos.ids[FINGERS.index(name)] for name in settings.scene.fingers]
+    missing = [settings.servos.ids[finger] for finger in settings.scene.indices]
     while missing:
         missing = [servo_id for servo_id in missing if line.ping(servo_id, tries=1) is None]
         if time.monotonic() > end:

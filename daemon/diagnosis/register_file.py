@@ -20,7 +20,6 @@ from softfinger.daemon.servos.checks import Registers
 from softfinger.daemon.servos.joint import servo_name
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import REGISTERS
-from softfinger.daemon.types import FINGERS
 
 _FILE_SIZE_MAX = 1 << 20  # maximum file size [bytes]
 _PASS_COUNT = 2  # number of passes; a servo may reject a lower limit until the upper limit is set
@@ -57,7 +56,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
     servos: list[StoredServo] = []
     found = []
     with open_line(settings.servos.port, settings.servos.baud) as line:
-        for finger in map(FINGERS.index, settings.scene.fingers):
+        for finger in settings.scene.indices:
             servo_id = settings.servos.ids[finger]
             table = Registers.read(line, servo_id)
             if not table:
@@ -87,7 +86,7 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
     stored = _stored(path)
     result: list[Finding] = []
     with open_line(settings.servos.port, settings.servos.baud) as line:
-        for finger in map(FINGERS.index, settings.scene.fingers):
+        for finger in settings.scene.indices:
             servo_id = settings.servos.ids[finger]
             name, kept = servo_name(servo_id, finger), stored.get(servo_id)
             if kept is None:

@@ -19,7 +19,7 @@ from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.errors import ServosSilent
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
-from softfinger.daemon.loop.loop import EventSink, Loop
+from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.loop.warm_up import WantedScene, warm_up
 from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
@@ -27,7 +27,7 @@ from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
-from softfinger.daemon.types import FINGERS, HandInfo
+from softfinger.daemon.types import EventSink, HandInfo
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.local_stop import LocalStop
 from softfinger.daemon.wire.loop_link import Link
@@ -97,8 +97,9 @@ class Daemon:
         for each in perception.fingers:
             self._closers.append(each.sensor.close)
             each.sensor.open()
-        self.loop = Loop(settings, self.clock, self.servos, perception, publisher, server, on_event)
-        self.loop.publish_truth(self.hand)
+        self.loop = Loop(
+            settings, self.clock, self.servos, perception, publisher, server, on_event, self.hand
+        )
         if publisher is not None:
             publisher.settings(
                 self.clock.wall(), self.clock.now(), hand_info(settings, self.models)
@@ -157,11 +158,7 @@ class Daemon:
         from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
         real = self._hand_settings
-        table = None
-        if real is settings:
-            table = next((each.table for each in self.models if not each.own_material), None)
-        if table is None:
-            table = make_table(real, make_material(real.material))
+        table = make_table(real, make_material(real.material))
         own = backend("servos", settings.servos.backend).hand
         made: SimulatedHand = (own if callable(own) else SimulatedHand)(
             real, self.clock.now(), table
@@ -170,7 +167,7 @@ class Daemon:
 
     def _make_sensors(self) -> dict[int, TactileSensor]:
         made = {}
-        for finger in sorted(FINGERS.index(name) for name in self.settings.scene.fingers):
+        for finger in self.settings.scene.indices:
             sensor = make_sensor(self.settings, self.clock, self.hand, finger)
             if sensor is not None:
                 made[finger] = sensor

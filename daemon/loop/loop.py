@@ -25,12 +25,10 @@ from softfinger.daemon.safety.heat import HeatWatch
 from softfinger.daemon.safety.safety import BUS, Breach, Safety
 from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.servos.base import Servos
-from softfinger.daemon.types import State, Truth
+from softfinger.daemon.types import EventSink, State, Truth
 from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import Publisher
-
-EventSink = Callable[[str, str, str], None]
 
 # Maximum age of commands that switch torque on or move the hand [s]. A higher limit applies to
 # ``hold`` during a grip.
@@ -68,6 +66,7 @@ class Loop:
         publisher: Publisher | None,
         server: Commands | None,
         on_event: EventSink | None = None,
+        truth: Truth | None = None,
     ) -> None:
         self.state = State(t=clock.now(), wall=clock.wall())
         self.period = 1.0 / settings.loop.rate
@@ -80,7 +79,7 @@ class Loop:
         grasp, sensors = perception.filter.grasp, perception.fingers
         self._control = Control(settings, self.state, grasp)
         self._task = Task.named(settings)
-        self._safety = Safety(settings, servos is not None, bool(sensors), grasp, sensors)
+        self._safety = Safety(settings, grasp, sensors)
         self._heat = HeatWatch(settings, self.state)
         self.torque = TorqueState(
             servos, settings.servos, self.state, self._safety, self._fail, self.emit
@@ -100,7 +99,7 @@ class Loop:
         self._lateness = Lateness(settings, self.state.timing, clock.pauses_when_late)
         self._publishing = None
         if publisher is not None:
-            self._publishing = Publishing(settings, publisher, sensors, self.statistics)
+            self._publishing = Publishing(settings, publisher, sensors, self.statistics, truth)
         self.heartbeat: Callable[[float], None] | None = None  # called with each tick's end time
         self._reports: deque[tuple[str, str, str]] = deque()  # events reported outside a tick
         self._ending = False
@@ -121,11 +120,6 @@ class Loop:
     def report(self, level: str, kind: str, text: str) -> None:
         """Emit an event on the next tick. This method is thread-safe."""
         self._reports.append((level, kind, text))
-
-    def publish_truth(self, truth: Truth | None) -> None:
-        """Publish the true state of a simulated hand to subscribers of ``hand/truth``."""
-        if self._publishing is not None:
-            self._publishing.truth = truth
 
     # Time
 
@@ -198,7 +192,7 @@ class Loop:
         self.perception.update(state)
         self._decide()
         decided = clock.host()
-        self.torque.write(self._control.torque, now)
+        self.torque.write(self._control.torque)
         written = clock.host()
         if self._publishing is not None:
             self._publishing(state)
@@ -220,7 +214,7 @@ class Loop:
         state, reading = self.state, self.state.reading
         state.read_error = state.write_error = ""
         try:
-            self.torque.read(reading)
+            self.torque.read()
         except ServoError as error:
             reading.valid = False
             state.read_error = str(error)
@@ -247,7 +241,7 @@ class Loop:
             self._requests.watch_silence()
         state.mode = control.mode
         self._react(self._safety.judge(state))
-        if self._heat.due and (action := self._heat.act(control, control.events)):
+        if self._heat.due and (action := self._heat.act(control)):
             self._requests.end_grip(action)
         if self._safety.must_hold and state.mode in GRIPPING_MODES:
             control.hold_goal(state.goal)
@@ -317,7 +311,7 @@ class Loop:
         self._publish_command(request, "")
         self._commanded = True
         if name == "clear":
-            self._latch("", "")
+            self.state.fault = self.state.fault_name = ""
         if self._task is not None and not by_task:
             self._end_task(f"the command {name} was received")
         if name == "demo":
@@ -359,17 +353,11 @@ class Loop:
         return self._lateness.with_cause(name, text, at_work)
 
     def _fail(self, reason: str, name: str = BUS) -> None:
+        """Latch a fault, unless another fault is latched."""
         if not self.state.fault:
             if name == BUS:
                 reason = self._with_cause(name, reason)
-            self._latch(reason, name)
+            self.state.fault, self.state.fault_name = reason, name
             self._control.fail(reason, name)
             self._emit_events()
             self.state.mode = self._control.mode
-
-    def _latch(self, reason: str, name: str) -> None:
-        """Latch a fault, or clear the latched fault if ``reason`` is empty.
-
-        Only this method changes the fault.
-        """
-        self.state.fault, self.state.fault_name = reason, name

@@ -9,15 +9,13 @@ tick.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.loop import Loop
-from softfinger.daemon.perception.finger_model import make_models
+from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.tactile.replay import GivenFrames
@@ -29,31 +27,15 @@ from softfinger.daemon.wire.loop_link import Link
 class ProcessReplay:
     """Loop that runs on recorded inputs."""
 
-    def __init__(self, settings: Settings, calibrations: Sequence[str]) -> None:
-        """Build the loop from recorded settings.
-
-        Parameters
-        ----------
-        settings : settings of the recording
-        calibrations : calibration of each finger as JSON text, empty if uncalibrated
-
-        Raises
-        ------
-        SettingsError, TactileError
-            If the settings and calibrations do not match.
-        """
-        with tempfile.TemporaryDirectory() as folder:
-            settings = with_calibrations(settings, calibrations, Path(folder))
-            models = make_models(settings)
+    def __init__(self, settings: Settings, models: tuple[FingerModel, FingerModel]) -> None:
+        """Build the loop from the settings of a recording and the models of its fingers."""
         # Disable the task, because the recording contains the task's commands.
         settings = settings.model_copy(update={"task": TaskSettings()})
         self._clock = _Clock()
         self._commands = _Commands()
         self._servos = _Servos() if settings.servos.backend != "none" else None
-        self._sensors: dict[int, GivenFrames] = {}
-        if settings.tactile.backend != "none":
-            for name in settings.scene.fingers:
-                self._sensors[FINGERS.index(name)] = GivenFrames()
+        sensing = [] if settings.tactile.backend == "none" else settings.scene.indices
+        self._sensors = {finger: GivenFrames() for finger in sensing}
         self._loop = Loop(
             settings,
             self._clock,
@@ -95,18 +77,6 @@ class ProcessReplay:
         loop.state.timing.busy_s = taken["busy_s"]
         loop.tick(taken["t"])
         return loop.state
-
-
-def with_calibrations(settings: Settings, calibrations: Sequence[str], folder: Path) -> Settings:
-    """Write JSON calibrations to files in ``folder``; return settings that refer to the files."""
-    files = ["", ""]
-    for finger, text in enumerate(calibrations):
-        if text:
-            path = folder / f"{FINGERS[finger]}.json"
-            path.write_text(text, encoding="utf-8")
-            files[finger] = str(path)
-    tactile = settings.tactile.model_copy(update={"calibration": (files[0], files[1])})
-    return settings.model_copy(update={"tactile": tactile})
 
 
 class _Clock(VirtualClock):

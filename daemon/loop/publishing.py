@@ -46,10 +46,13 @@ class Publishing:
         publisher: Publisher,
         perceptions: list[FingerPerception],
         statistics: Statistics,
+        truth: Truth | None = None,
     ) -> None:
+        """Create the publisher; ``truth`` is the true state of a simulated hand."""
         self._publisher = publisher
         self._perceptions = perceptions
         self._statistics = statistics
+        self._truth = truth
         rate, stream = settings.loop.rate, settings.stream
         self._period = 1.0 / rate
         self._state_every = every(rate, stream.state_rate)
@@ -57,7 +60,6 @@ class Publishing:
         self._stats_phase = _STATS_PHASE % self._stats_every
         self._frames_every = every(settings.tactile.rate, stream.tactile_rate)
         self._scene = parts(settings)
-        self.truth: Truth | None = None  # for simulated hands only
         self._numbers = [0, 0]  # number of published frames per finger
         self._published = [-1, -1]  # `Frame.seq` // n of the last published frame, per finger
         self._states = self._maps = 0  # numbers of published messages
@@ -80,8 +82,8 @@ class Publishing:
             if wanted & _STATE:
                 self._states += 1
                 publisher.send(schema.STATE, state, self._scene, self._state_every)
-            if wanted & _TRUTH and self.truth is not None:
-                publisher.send(schema.TRUTH, state, self.truth, self._state_every)
+            if wanted & _TRUTH and self._truth is not None:
+                publisher.send(schema.TRUTH, state, self._truth, self._state_every)
         if seq % self._stats_every == self._stats_phase:
             rates = self._rates(state)
             if wanted & _STATS:

@@ -16,8 +16,8 @@ import socket
 import struct
 import sys
 import threading
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 
 from softfinger.daemon.port_access import serial_group
 from softfinger.daemon.profile.settings import Settings
@@ -66,7 +66,7 @@ class RealTime:
     def __init__(self, settings: Settings) -> None:
         self.granted: list[str] = []
         self.refused: list[str] = []  # refused settings, each with its consequence and remedy
-        self._undo: list[Callable[[], object]] = []
+        self._undo = ExitStack()
         wanted = settings.realtime
         self._keep_interpreter(wanted.freeze_collector)
         if settings.loop.clock == "virtual":
@@ -84,7 +84,7 @@ class RealTime:
         if wanted.timer_slack:
             self._sharpen_timer(max(round(wanted.timer_slack * 1e9), 1))
         if wanted.spin:
-            self._granted(f"busy-waiting for {wanted.spin * 1e6:g} µs before each tick")
+            self.granted.append(f"busy-waiting for {wanted.spin * 1e6:g} µs before each tick")
 
     def events(self) -> list[tuple[str, str, str]]:
         """Return one event for all granted settings, and one event for each refused setting."""
@@ -93,21 +93,14 @@ class RealTime:
 
     def close(self) -> None:
         """Undo all settings. Never raises."""
-        while self._undo:
-            try:
-                self._undo.pop()()
-            except OSError:
-                pass  # The thread may have exited.
+        with suppress(OSError):  # A thread may have exited.
+            self._undo.close()
 
     def __enter__(self) -> RealTime:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _granted(self, text: str, *undo: Callable[[], object]) -> None:
-        self.granted.append(text)
-        self._undo += undo
 
     def _refused(self, text: str, remedy: str = "") -> None:
         self.refused.append(f"{text}; to allow this: {remedy}" if remedy else text)
@@ -119,10 +112,11 @@ class RealTime:
         objects are frozen. Another thread may hold the interpreter lock for one switch interval, so
         the default of 5 ms is reduced.
         """
-        self._undo += [gc.unfreeze, partial(sys.setswitchinterval, sys.getswitchinterval())]
+        self._undo.callback(gc.unfreeze)
+        self._undo.callback(sys.setswitchinterval, sys.getswitchinterval())
         if freeze:
             gc.freeze()
-            self._granted("garbage collector frozen")
+            self.granted.append("garbage collector frozen")
         gc.enable()
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
@@ -134,25 +128,24 @@ class RealTime:
         then delay the loop. Native threads, such as ZeroMQ's, and child processes are scheduled
         normally.
         """
-        undo: list[Callable[[], object]] = []
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         try:
-            for thread in _threads():
-                before = os.sched_getscheduler(thread), os.sched_getparam(thread)
-                mine = thread == threading.get_native_id()
-                level = os.sched_param(priority if mine else max(priority - 1, 1))
-                os.sched_setscheduler(thread, policy, level)
-                undo.append(partial(os.sched_setscheduler, thread, *before))
+            with ExitStack() as undo:
+                for thread in _threads():
+                    before = os.sched_getscheduler(thread), os.sched_getparam(thread)
+                    mine = thread == threading.get_native_id()
+                    level = os.sched_param(priority if mine else max(priority - 1, 1))
+                    os.sched_setscheduler(thread, policy, level)
+                    undo.callback(os.sched_setscheduler, thread, *before)
+                self._undo.push(undo.pop_all())
         except OSError as error:
-            for each in undo:
-                each()
             self._refused(
                 f"SCHED_FIFO {priority} denied ({error.strerror}): other processes can delay a "
                 "tick",
                 GRANT_PRIORITY,
             )
         else:
-            self._granted(f"SCHED_FIFO {priority}", *undo)
+            self.granted.append(f"SCHED_FIFO {priority}")
 
     def _shorten_slice(self, nanoseconds: int) -> None:
         """Shorten the time slice of the interpreter's threads if SCHED_FIFO is not in use.
@@ -166,8 +159,9 @@ class RealTime:
         threads = _threads()
         shortened = [_set_slice(calls, thread, nanoseconds) for thread in threads]
         if any(shortened):  # Older kernels ignore the requested slice.
-            undo = [partial(_set_slice, calls, thread, 0) for thread in threads]
-            self._granted(f"scheduler slices of {nanoseconds * 1e-6:g} ms", *undo)
+            for thread in threads:
+                self._undo.callback(_set_slice, calls, thread, 0)
+            self.granted.append(f"scheduler slices of {nanoseconds * 1e-6:g} ms")
 
     def _keep_to_processors(self, cpus: tuple[int, ...]) -> None:
         """Pin the loop thread to a set of processors, which other threads may still use."""
@@ -182,7 +176,8 @@ class RealTime:
                 "loop may move between processors"
             )
         else:
-            self._granted(f"processor {names}", partial(os.sched_setaffinity, 0, before))
+            self._undo.callback(os.sched_setaffinity, 0, before)
+            self.granted.append(f"processor {names}")
 
     def _lock_memory(self) -> None:
         """Lock each page in memory on first access. Warm-up has already accessed the loop's pages.
@@ -200,7 +195,8 @@ class RealTime:
             text = f"memory lock denied ({why}): the loop's memory can be swapped out"
             self._refused(text, GRANT_MEMORY_LOCK)
         else:
-            self._granted("memory locked", _LIBC.munlockall)
+            self._undo.callback(_LIBC.munlockall)
+            self.granted.append("memory locked")
 
     def _hold_latency(self) -> None:
         """Prevent deep processor idle states while the device file is open."""
@@ -216,7 +212,8 @@ class RealTime:
             os.close(descriptor)
             self._refused(f"{_LATENCY_DEVICE} denied ({error.strerror})")
         else:
-            self._granted("deep idle states disabled", partial(os.close, descriptor))
+            self._undo.callback(os.close, descriptor)
+            self.granted.append("deep idle states disabled")
 
     def _sharpen_timer(self, nanoseconds: int) -> None:
         """Reduce the timer slack, i.e. the time by which the kernel may delay wake-ups."""
@@ -224,8 +221,8 @@ class RealTime:
             why = os.strerror(ctypes.get_errno())
             self._refused(f"timer slack denied ({why}): wake-ups may be 50 µs late")
         else:  # A value of 0 restores the initial slack.
-            undo = partial(_LIBC.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
-            self._granted(f"timer slack {nanoseconds} ns", undo)
+            self._undo.callback(_LIBC.prctl, _PR_SET_TIMERSLACK, 0, 0, 0, 0)
+            self.granted.append(f"timer slack {nanoseconds} ns")
 
 
 def _threads() -> list[int]:
@@ -286,11 +283,9 @@ class Service:
         self._due = t + self._every
         self._send(message)
 
-    def stopping(self) -> None:
-        """Report that shutdown has begun."""
-        self._send(b"STOPPING=1")
-
     def close(self) -> None:
+        """Report that shutdown has begun, and close the socket."""
+        self._send(b"STOPPING=1")
         self._socket.close()
 
     def _send(self, message: bytes) -> None:

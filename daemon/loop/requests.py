@@ -26,7 +26,7 @@ from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.safety import Safety
 from softfinger.daemon.safety.torque_state import TorqueState
-from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, State
+from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, EventSink, State
 
 AGE_MAX = 1.0  # maximum age of all commands except status and stop [s]
 _COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
@@ -143,7 +143,7 @@ class Requests:
         safety: Safety,
         torque: TorqueState,
         perception: Perception,
-        emit: Callable[[str, str, str], None],
+        emit: EventSink,
         command_age_max: float,
     ) -> None:
         """Create the executor.

@@ -19,7 +19,7 @@ from softfinger.daemon.perception.calibration_file import Converter, calibration
 from softfinger.daemon.perception.finger_model import FingerModel, make_estimator, make_models
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS, Contact, Frame, ObjectPose, Reading
+from softfinger.daemon.types import Contact, EventSink, Frame, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel_folder import is_marked, kernel_folder, mark
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
@@ -30,9 +30,7 @@ from softfinger.kinematics.hand.servo_heat import HeatState, follow, time_to_lim
 class WantedScene:
     """Scene whose kernels are compiled; ``on_event`` receives events about the finger models."""
 
-    def __init__(
-        self, settings: Settings, on_event: Callable[[str, str, str], None] | None = None
-    ) -> None:
+    def __init__(self, settings: Settings, on_event: EventSink | None = None) -> None:
         self.settings = settings
         self._on_event = on_event
 
@@ -44,9 +42,7 @@ class WantedScene:
     @property
     def sensing(self) -> list[int]:
         """Indices of the fingers with a sensor."""
-        if self.settings.tactile.backend == "none":
-            return []
-        return sorted(FINGERS.index(name) for name in self.settings.scene.fingers)
+        return [] if self.settings.tactile.backend == "none" else self.settings.scene.indices
 
 
 class Part(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +20,7 @@ from softfinger.daemon.profile.factory import (
 )
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import plausibility_warnings
-from softfinger.daemon.types import FINGERS
+from softfinger.daemon.types import FINGERS, EventSink
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -42,14 +41,9 @@ class FingerModel:
     calibration: Calibration | None
     prior: Prior
 
-    @property
-    def own_material(self) -> bool:
-        """True if the tip's stress-strain law comes from a calibration file."""
-        return self.calibration is not None and self.calibration.modulus is not None
-
 
 def make_models(
-    settings: Settings, on_event: Callable[[str, str, str], None] | None = None
+    settings: Settings, on_event: EventSink | None = None
 ) -> tuple[FingerModel, FingerModel]:
     """Create the models of both fingers.
 

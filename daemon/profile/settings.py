@@ -36,7 +36,7 @@ from softfinger.daemon.profile.fields import (
     setting,
 )
 from softfinger.daemon.profile.simulation_settings import SimulationSettings
-from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
+from softfinger.daemon.types import COMMAND_ADDRESS, FINGERS, STREAM_ADDRESS
 
 Finger = Literal["left", "right"]
 Cells = tuple[tuple[Index, Index], ...]
@@ -53,6 +53,11 @@ class SceneSettings(Section):
     object_model: bool = setting(
         True, "", "Estimate the object's angle and width from both contacts."
     )
+
+    @property
+    def indices(self) -> list[int]:
+        """Indices of the fingers: 0 for the left finger, 1 for the right finger."""
+        return sorted(FINGERS.index(name) for name in self.fingers)
 
 
 class GeometrySettings(Section):

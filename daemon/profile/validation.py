@@ -218,18 +218,23 @@ def _servos(settings: Settings) -> Iterator[str]:
         yield f"servos.ids: found {shown(servos.ids)}, expected two different IDs"
 
 
-def _ports(settings: Settings) -> Iterator[str]:
-    """Check that each device has its own port. Plugin ports are not checked."""
+def device_ports(settings: Settings) -> list[tuple[str, str]]:
+    """Return the settings key and path of each required port, except the ports of plugins."""
     ports = []
     servos = backend("servos", settings.servos.backend)
     tactile = backend("tactile", settings.tactile.backend)
     if servos.metal and not servos.source:
         ports.append(("servos.port", settings.servos.port))
     if tactile.metal and not tactile.source:
-        for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+        for finger in settings.scene.indices:
             ports.append((f"tactile.port ({FINGERS[finger]})", settings.tactile.port[finger]))
+    return ports
+
+
+def _ports(settings: Settings) -> Iterator[str]:
+    """Check that each device has its own port. Plugin ports are not checked."""
     taken: dict[str, str] = {}
-    for key, port in ports:
+    for key, port in device_ports(settings):
         place = os.path.realpath(port)
         if place in taken:
             same = "" if place == port else f", a link to {shown(place)}"

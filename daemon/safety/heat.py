@@ -17,7 +17,7 @@ from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.types import FINGERS, Event, State
+from softfinger.daemon.types import FINGERS, State
 from softfinger.kinematics.hand.servo_heat import (
     AMBIENT,
     CASE,
@@ -70,11 +70,10 @@ class HeatWatch:
         """Create a monitor that reads ``state.reading`` and updates ``state.heat``."""
         self._limits = settings.safety
         self._state = state
-        self._fingers = [FINGERS.index(name) for name in sorted(settings.scene.fingers)]
+        self._fingers = settings.scene.indices
         self._states = [HeatState(), HeatState()]
-        if settings.servos.backend != "none":
-            for each in self._states:
-                set_law(each.law, settings)
+        for each in self._states:
+            set_law(each.law, settings)
         self._heat = [0.0, 0.0]  # ∫ I² dt since the last update [A² s]
         self._square = [0.0, 0.0]  # low-pass filtered squared current [A²]
         self._t = math.nan  # time of the last reading [s]
@@ -118,18 +117,15 @@ class HeatWatch:
             limit = self._limits.temperature_max - _HALF_STEP
             estimate.time_to_limit = time_to_limit(heat.array, self._square[i], limit)
 
-    def act(self, control: Control, events: list[Event]) -> str:
+    def act(self, control: Control) -> str:
         """Reduce the grip force if a servo is about to overheat.
 
         Return ``heat_action`` if the action is due, otherwise "".
         """
         state = self._state
-        if state.mode not in GRIPPING_MODES:
-            self._error_reported = False
-            return ""
         i = min(self._fingers, key=lambda k: state.heat[k].time_to_limit)
         left = state.heat[i].time_to_limit
-        if left > self._limits.heat_warn:
+        if state.mode not in GRIPPING_MODES or left > self._limits.heat_warn:
             self._error_reported = False
             return ""
         hot = self._limits.temperature_max
@@ -137,14 +133,14 @@ class HeatWatch:
         if state.t - self._reduction_time < _SETTLING_TIME and left > _ACTION_TIME:
             return ""  # The last reduction has not taken effect yet.
         now = state.goal.force
-        square = sustained_square(self._states[i], self._limits.temperature_max - _TARGET_MARGIN)
+        square = sustained_square(self._states[i], hot - _TARGET_MARGIN)
         lasts = now * math.sqrt(square / max(self._square[i], 1e-6))
         eased = max(min(lasts, now), _FRACTION_MIN * now, control.grip.force_for_load())
         if eased < _FRACTION_MAX * now:
             self._reduction_time = state.t
             control.limit_force(eased, _ACTION_TIME)
             text = f"{who}: the grip force was reduced from {now:.1f} to {eased:.1f} N"
-            events.append(("warning", "servos.heat", text))
+            control.events.append(("warning", "servos.heat", text))
             return ""
         if left > _ERROR_TIME:
             return ""
@@ -155,5 +151,5 @@ class HeatWatch:
                 f"{who}, and the load does not allow a lower grip force; safety.heat_action = "
                 f"{action}"
             )
-            events.append(("error", "servos.heat", text))
+            control.events.append(("error", "servos.heat", text))
         return action if left < _ACTION_TIME and action != "hold" else ""

@@ -107,13 +107,13 @@ class View:
     def __init__(
         self,
         settings: Settings,
-        grasp: GraspState | None = None,
-        sensors: Sequence[FingerPerception] = (),
+        grasp: GraspState,
+        sensors: Sequence[FingerPerception],
     ) -> None:
         self.settings = settings
         self.limits = settings.safety
-        self.fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
-        self.grasp = GraspState() if grasp is None else grasp
+        self.fingers = settings.scene.indices
+        self.grasp = grasp
         self.sensors = sensors
         self.wiring = WiringWatch(self.fingers)
         self.failed = 0.0  # fraction of failed readings in about the last second
@@ -129,12 +129,11 @@ class View:
         self._target = math.nan  # commanded grip force on the previous tick [N]
         self.rise_t = math.inf  # time of a commanded force increase that is not yet measured [s]
         self.rise_felt = 0.0  # measured force at `rise_t` [N]
-        low, high = settings.safety.voltage_min, settings.safety.voltage_max
-        if settings.servos.backend != "none":
-            model = by_name(settings.servos.model)
-            low = low or model.voltage_min * VOLTAGE_UNIT
-            high = high or model.voltage_max * VOLTAGE_UNIT
-        self.voltage = (low, high)
+        model = by_name(servos.model)
+        self.voltage = (
+            self.limits.voltage_min or model.voltage_min * VOLTAGE_UNIT,
+            self.limits.voltage_max or model.voltage_max * VOLTAGE_UNIT,
+        )
 
     def update(self, state: State) -> None:
         """Update the history with the state of the current tick."""
@@ -205,14 +204,14 @@ class Limit:
     check: Check | None = None
     lasts: float | str = 0.0  # minimum duration of a violation [s], or the setting that contains it
     fraction: float = 1.0  # fraction of the bound at which a violation is reported
+    warn_at: float = 0.0  # fraction of the bound at which a fault limit also warns; 0 for never
     in_turn: bool = False  # True if the check takes turns with others, one check per tick
     gripping: bool = False  # True if the limit applies only while gripping
 
     def __call__(self, check: Check) -> Check:
-        """Add the row with its check to `LIMITS`.
-
-        If several rows decorate one check, the row closest to the function is added first.
-        """
+        """Add the row with its check to `LIMITS`, after a row for the warning, if there is one."""
+        if self.warn_at:
+            LIMITS.append(replace(self, check=check, level="warn", fraction=self.warn_at))
         LIMITS.append(replace(self, check=check))
         return check
 
@@ -532,9 +531,8 @@ LIMITS += [
 # --- tips -----------------------------------------------------------------------------------------
 
 
-@Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors").each
-@Limit("tip.force", "normal force of a tip", "warn", ("safety.force_max",), "sensors",
-    fraction=_WARNING_FRACTION).each  # fmt: skip
+@Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors",
+    warn_at=_WARNING_FRACTION).each  # fmt: skip
 def _tip_force(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.force_max, state.contacts[i]
     if not _touches(contact) or contact.force <= bound:
@@ -542,9 +540,8 @@ def _tip_force(view: View, state: State, fraction: float, i: int) -> str:
     return f"the {FINGERS[i]} tip force is {contact.force:.1f} N, above {bound:g} N"
 
 
-@Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors").each
-@Limit("tip.displacement", "displacement of a tip", "warn", ("safety.d_max",), "sensors",
-    fraction=_WARNING_FRACTION).each  # fmt: skip
+@Limit("tip.displacement", "displacement of a tip", "fault", ("safety.d_max",), "sensors",
+    warn_at=_WARNING_FRACTION).each  # fmt: skip
 def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
     bound, contact = fraction * view.limits.d_max, state.contacts[i]
     if not _touches(contact) or contact.d <= bound:
@@ -553,13 +550,8 @@ def _tip_displacement(view: View, state: State, fraction: float, i: int) -> str:
     return f"the {FINGERS[i]} tip displacement is {d:.2f} mm, above {largest:g} mm"
 
 
-_TILT_TEXT = "|θ|; the limit is asin(1 − d/a) minus a margin"
-
-
-@Limit("tip.tilt", _TILT_TEXT, "fault", ("safety.theta_margin",), "sensors").each
-@Limit(
-    "tip.tilt", _TILT_TEXT, "warn", ("safety.theta_margin",), "sensors", fraction=_WARNING_FRACTION
-).each
+@Limit("tip.tilt", "|θ|; the limit is asin(1 − d/a) minus a margin", "fault",
+    ("safety.theta_margin",), "sensors", warn_at=_WARNING_FRACTION).each  # fmt: skip
 def _tip_tilt(view: View, state: State, fraction: float, i: int) -> str:
     """Check that |θ| ≤ fraction·(asin(1 − d/a) − margin).
 
@@ -746,14 +738,11 @@ def _tactile_misfit(_: View, state: State, __: float, i: int) -> str:
 # --- the hand and its grip ------------------------------------------------------------------------
 
 _ANGLE_SIGMA = 4.0  # smallest significant difference between the angles, in standard deviations
-_ANGLE_TEXT = "difference between the two fingers' estimates of the object's angle"
-_ANGLE_KEYS = ("safety.residual_angle", "object.taper")
 
 
-@Limit("hand.angle", _ANGLE_TEXT, "fault", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2)
-@Limit(
-    "hand.angle", _ANGLE_TEXT, "warn", _ANGLE_KEYS, "sensors", in_turn=True, lasts=0.2, fraction=0.5
-)
+@Limit("hand.angle", "difference between the two fingers' estimates of the object's angle", "fault",
+    ("safety.residual_angle", "object.taper"), "sensors", in_turn=True, lasts=0.2,
+    warn_at=0.5)  # fmt: skip
 def _hand_angle(view: View, state: State, fraction: float) -> str:
     if not view.touched(state) or len(view.sensors) < 2:
         return ""

@@ -76,17 +76,16 @@ class Safety:
     def __init__(
         self,
         settings: Settings,
-        has_servos: bool,
-        has_sensors: bool,
-        grasp: GraspState | None = None,
-        sensors: Sequence[FingerPerception] = (),
+        grasp: GraspState,
+        sensors: Sequence[FingerPerception],
     ) -> None:
         """Create the checks, which read ``grasp`` and ``sensors`` but never modify them."""
         view = self._view = View(settings, grasp, sensors)
         limits, hand = settings.safety, settings.hand
         self._limits = limits
-        self._has_sensors = has_sensors
-        there = {"": True, "servos": has_servos, "sensors": has_sensors}
+        self._has_sensors = settings.tactile.backend != "none"
+        has_servos = settings.servos.backend != "none"
+        there = {"": True, "servos": has_servos, "sensors": self._has_sensors}
         watches = [
             _Watch(limit, limit.check, view)
             for limit in LIMITS
@@ -182,8 +181,7 @@ class Safety:
                 return
             self._sent_q[i] = q[i]
             self._sent_current[i] = current[i]
-        if goal.valid:
-            servos.write(goal)
+        servos.write(goal)
 
     def _bound_goal(self, goal: Goal, i: int, low: float, high: float, present: float) -> None:
         q, current = goal.q[i], goal.current[i]

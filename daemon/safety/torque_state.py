@@ -17,7 +17,7 @@ from softfinger.daemon.profile.settings import ServoSettings
 from softfinger.daemon.safety.safety import BUS, TORQUE_OFF, Safety
 from softfinger.daemon.servos.base import Servos
 from softfinger.daemon.servos.control_table import WATCHDOG_UNIT
-from softfinger.daemon.types import Reading, State
+from softfinger.daemon.types import EventSink, Reading, State
 
 # Duration of repeated torque-off attempts, as a fraction of the watchdog time. After the attempts,
 # the bus is kept silent.
@@ -36,7 +36,7 @@ class TorqueState:
         state: State,
         safety: Safety,
         fail: Callable[[str, str], None],
-        emit: Callable[[str, str, str], None],
+        emit: EventSink,
     ) -> None:
         """Create the controller.
 
@@ -65,7 +65,7 @@ class TorqueState:
         """True while torque off has been requested but not confirmed."""
         return self._tried_since < math.inf
 
-    def read(self, reading: Reading) -> None:
+    def read(self) -> None:
         """Read the servos. A pending torque-off request is repeated in the same bus exchange.
 
         Raises ServoError like `Servos.read`.
@@ -75,13 +75,13 @@ class TorqueState:
         if servos is None:
             return
         if not self.pending:
-            servos.read(reading)
+            servos.read(state.reading)
         elif self._is_silent():
-            reading.valid = False
+            state.reading.valid = False
         else:
-            self._try(servos, reading)
+            self._try(servos, state.reading)
 
-    def write(self, requested: bool, now: float) -> None:
+    def write(self, requested: bool) -> None:
         """Switch torque on or off as ``requested``. While torque is on, send the goal."""
         state, servos = self._state, self.servos
         if servos is None:
@@ -93,7 +93,7 @@ class TorqueState:
             self._on(servos)
         elif state.goal.valid:
             state.goal.seq = state.seq
-            state.goal.t = now
+            state.goal.t = state.t
             try:
                 self._safety.write(servos, state)
             except ServoError as error:

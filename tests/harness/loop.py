@@ -7,9 +7,18 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
+from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.types import Event, Frame
+from softfinger.daemon.wire.schema import STATE
+from tests.harness.golden_wire import message_maker
 
 Make = Callable[..., Daemon]
+_message = message_maker(STATE)
+
+
+def state_message(daemon: Daemon) -> dict[str, Any]:
+    """Return the ``hand/state`` message of the current tick."""
+    return _message(daemon.loop.state, parts(daemon.settings))
 
 
 def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:
@@ -29,10 +38,14 @@ def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
         daemon.loop.advance(0.01)
 
 
-def grasped(daemon: Daemon, force: float) -> Daemon:
+def armed(daemon: Daemon) -> Daemon:
     command(daemon, "arm")
     daemon.loop.advance(0.1)
-    command(daemon, "grasp", force=force)
+    return daemon
+
+
+def grasped(daemon: Daemon, force: float) -> Daemon:
+    command(armed(daemon), "grasp", force=force)
     advance_to(daemon, "holding", 3.0)
     return daemon
 

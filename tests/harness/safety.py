@@ -1,5 +1,6 @@
 """Create states for tests of the limits, and `Safety` objects that check the states."""
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -39,8 +40,10 @@ class Sensor:
             self.changed_time = t
 
 
-def safety(has_servos: bool = True, has_sensors: bool = True, **parts: Any) -> Safety:
-    return Safety(SETTINGS, has_servos, has_sensors, **parts)
+def safety(
+    settings: Settings = SETTINGS, grasp: GraspState | None = None, sensors: Sequence[Any] = ()
+) -> Safety:
+    return Safety(settings, grasp or GraspState(), sensors)
 
 
 def sound(mode: Mode = Mode.HOLDING) -> State:

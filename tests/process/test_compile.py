@@ -78,6 +78,14 @@ def test_a_part_is_compiled_once_and_has_the_kernel_count_of_the_progress_bar(tm
     )
 
 
+def test_kernels_that_cannot_be_stored_are_a_failure(tmp_path):
+    file = tmp_path / "file"
+    file.touch()
+    done = softfinger("compile", env=os.environ | {"NUMBA_CACHE_DIR": str(file)})
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines()[-1].startswith("the kernels can't be stored, so each process")
+
+
 def test_ctrl_c_before_a_compiler_thread_starts_is_passed_on(monkeypatch):
     def interrupted(_: threading.Thread) -> None:
         raise KeyboardInterrupt

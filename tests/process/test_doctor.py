@@ -15,7 +15,6 @@ from unittest.mock import Mock
 import pytest
 
 from softfinger.daemon.diagnosis import devices, machine, ports
-from softfinger.daemon.diagnosis import machine as kernels
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
@@ -26,6 +25,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import checks
 from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.servos.base import Finding
 from softfinger.kinematics.compiled.kernel_folder import find_kernel_folder
 from softfinger.tools.cli import main
 from softfinger.tools.setup import doctor
@@ -312,6 +312,19 @@ def test_latency_timer_is_checked_and_repaired(tmp_path, monkeypatch):
     assert checks.check_latency_timer("/dev/pts/0", 0.004, sysfs) is None
 
 
+def test_a_board_at_the_unused_servo_port_is_not_checked_as_a_servo(tmp_path, monkeypatch):
+    board = ['tactile.backend="flexitac"', 'tactile.port=["/dev/ttyUSB0", ""]']
+    changes = ['servos.backend="none"', 'scene.fingers=["left"]', *board]
+    settings = load(changes=changes)
+    assert settings.servos.port == settings.tactile.port[0]
+    latency = Mock(return_value=None)
+    monkeypatch.setattr(doctor, "check_latency_timer", latency)
+    monkeypatch.setattr(doctor, "check_port", lambda path, *_: Finding("pass", path, "free"))
+    found = list(doctor.results(settings, False, save=tmp_path / "servos.json"))
+    latency.assert_called_once_with("/dev/ttyUSB0", 1.0)
+    assert [each.status for each in found if each.subject == "servos"] == ["note"]
+
+
 # Checks of the machine.
 
 
@@ -351,19 +364,19 @@ def test_missing_damaged_and_writable_kernel_files_cause_warnings(tmp_path, monk
     scene = Settings.model_validate({"servos": {"backend": "none"}, "tactile": {"backend": "none"}})
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(warm_up, "kernel_folder", find_kernel_folder)
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert found.status == "warn"
     assert "not compiled yet: contact table, joints and timing;" in found.text
     for part in warm_up.parts(scene):
         warm_up.mark_built(part, scene)
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert found.status == "pass"
     (folder,) = tmp_path.glob("kernels-*")
     (folder / "grip.kernel").write_bytes(b"torn")
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert (found.status, found.text[:17]) == ("warn", "found 1 corrupted")
     folder.chmod(0o777)
-    (found,) = kernels.check_kernels(scene)
+    (found,) = machine.check_kernels(scene)
     assert found.status == "warn"
     assert "other users can write to it" in found.text
     assert "NUMBA_CACHE_DIR" in found.fix

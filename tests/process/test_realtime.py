@@ -7,10 +7,12 @@ import struct
 import time
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from softfinger.daemon.clock import RealClock
+from softfinger.daemon.loop import realtime
 from softfinger.daemon.loop.realtime import _ATTRIBUTE_CALLS, RealTime, _set_slice
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.benchmarks import tick
@@ -121,15 +123,28 @@ def test_refused_measures_are_reported_with_their_effect_and_remedy():
         assert any("/dev/cpu_dma_latency denied" in text and "udev" in text for text in refused)
 
 
+NOTHING = {
+    "freeze_collector": False,
+    "lock_memory": False,
+    "hold_latency": False,
+    "timer_slack": 0.0,
+    "spin": 0.0,
+    "slice": 0.0,
+}
+
+
+def test_a_thread_may_exit_while_a_denied_priority_is_reverted(monkeypatch):
+    outcomes = (None, PermissionError(1, "not permitted"), ProcessLookupError(3, "no such process"))
+    monkeypatch.setattr(os, "sched_setscheduler", Mock(side_effect=outcomes))
+    monkeypatch.setattr(realtime, "_threads", lambda: [0, 0])
+    settings = Settings.model_validate({"realtime": NOTHING | {"priority": 7}})
+    with RealTime(settings) as measures:
+        assert measures.granted == []
+        assert measures.refused[0].startswith("SCHED_FIFO 7 denied")
+
+
 def test_disabled_measures_are_not_requested():
-    nothing = {
-        "lock_memory": False,
-        "hold_latency": False,
-        "timer_slack": 0.0,
-        "spin": 0.0,
-        "slice": 0.0,
-    }
-    settings = Settings.model_validate({"realtime": {**nothing, "freeze_collector": False}})
+    settings = Settings.model_validate({"realtime": NOTHING})
     with RealTime(settings) as measures:
         assert measures.events() == []
     settings = Settings.model_validate(

@@ -139,9 +139,11 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_p
 def test_a_recorder_that_cannot_start_prevents_the_first_tick(profile, tmp_path, inline):
     path = tmp_path / "run.mcap"
     path.write_text("mine")
-    done = inline("run", "--config", profile(""), "--record", path)
+    done = inline("run", "--config", profile(""), "--record", path, "--log", "json")
     assert done.returncode == 1
-    assert "already exists; choose another file" in done.stderr
+    last = json.loads(done.stderr.splitlines()[-1])
+    assert last["level"] == "error"
+    assert "already exists; choose another file" in last["text"]
     assert path.read_text() == "mine"
 
 

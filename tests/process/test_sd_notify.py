@@ -59,11 +59,10 @@ def test_ready_is_sent_first_and_then_four_watchdog_messages_per_interval(manage
     service = Service(str(manager.path), watchdog=2.0)
     for tick in range(1000):  # 2 s
         service.alive(tick * 0.002)
-    service.stopping()
+    service.close()
     told = [manager.next() for _ in range(5)]
     assert told == [b"READY=1\nWATCHDOG=1", *[b"WATCHDOG=1"] * 3, b"STOPPING=1"]
     assert manager.quiet_for(0.0)
-    service.close()
 
 
 def test_a_missing_or_slow_manager_does_not_block_the_daemon(manager):
@@ -225,7 +224,7 @@ def test_plain_and_json_log_lines_have_the_same_content(tmp_path):
         log.take_over_logging()
         handler = logging.getLogger().handlers[-1]
         log.line("warning", "servos.temperature", 'left "servo"\nat 61 °C')
-        log.plain("softfinger: ended", "error")
+        log.line("error", "", "softfinger: ended")
         logging.getLogger("softfinger.daemon.servos.dynamixel").error("port %s is gone", "x")
         log.close()
         logging.getLogger().removeHandler(handler)
@@ -250,7 +249,7 @@ def test_journal_lines_have_priorities(capfd, monkeypatch):
     for form in ("plain", "json"):
         log = EventLog(form)
         log.line("warning", "bus", "slow\nand late", late_s=0.25)
-        log.plain("softfinger: exited with a fault", "error")
+        log.line("error", "", "softfinger: exited with a fault")
         log.close()
     *plain, line, last = capfd.readouterr().err.splitlines()
     ended = "<3>softfinger: exited with a fault"

@@ -396,9 +396,8 @@ class Soak:
         if listener is not None:
             publisher = loop._publisher = Publisher(listener)
             loop._publishing = Publishing(
-                self.settings, publisher, loop.perception.fingers, loop.statistics
+                self.settings, publisher, loop.perception.fingers, loop.statistics, self.hand
             )
-            loop.publish_truth(self.hand)
         self.hand.plant.parameters.torque_constant *= chance.uniform(0.9, 1.1)
         self.count = 0  # ticks so far
         self.held = False

@@ -10,16 +10,10 @@ from softfinger.daemon.control.modes import COMMANDS, REPLY
 from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.requests import bounds
-from tests.harness.loop import Make, advance_to, command, grasped
+from tests.harness.loop import Make, advance_to, armed, command, grasped
 
 ALONE = {"scene": {"fingers": ("left",), "object_model": False}}
 BLIND = {"tactile": {"backend": "none"}}
-
-
-def armed(daemon: Daemon) -> Daemon:
-    command(daemon, "arm")
-    daemon.loop.advance(0.05)
-    return daemon
 
 
 def held(daemon: Daemon) -> Daemon:

@@ -10,7 +10,7 @@ import pytest
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.safety.limits import JointMotion
 from softfinger.daemon.types import Reading
-from tests.harness.loop import advance_to, command, grasped, refusal
+from tests.harness.loop import advance_to, armed, command, grasped, refusal
 
 TICK = 0.002
 COUNT = 2.0 * math.pi / 4096
@@ -186,9 +186,7 @@ def test_grips_turns_stops_and_pushes_cause_no_false_alarm(make, mode):
 
 
 def test_position_mode_moves_without_current_checks(make):
-    daemon = make(servos={"mode": "position", "model": "XL430-W250"})
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
+    daemon = armed(make(servos={"mode": "position", "model": "XL430-W250"}))
     assert "does not limit the current" in refusal(daemon, "grasp", force=8.0)
     command(daemon, "move", left=0.05, right=-0.1)
     daemon.loop.advance(1.0)

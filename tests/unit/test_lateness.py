@@ -13,16 +13,11 @@ from softfinger.daemon.clock import HandClock, RealClock, VirtualClock, make_clo
 from softfinger.daemon.loop import build as build_module
 from softfinger.daemon.loop import timing
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.loop.timing import ATTRIBUTION_TIME, REPORT_INTERVAL, Lateness
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
-from softfinger.daemon.wire.schema import STATE
-from tests.harness.golden_wire import message_maker
 from tests.harness.late_machine import LateMachine
-from tests.harness.loop import advance_to, grasped
-
-state_message = message_maker(STATE)
+from tests.harness.loop import advance_to, grasped, state_message
 
 MOMENT = ("timestamp", "tick_s", "compute_s", "wake_late_s", "overruns", "behind_s")
 Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]
@@ -54,7 +49,7 @@ def ticked(daemon: Daemon, count: int) -> dict[str, Any]:
 
     loop.heartbeat = end_in_time
     loop.advance()
-    message = state_message(loop.state, parts(daemon.settings))
+    message = state_message(daemon)
     return {key: value for key, value in message.items() if key not in MOMENT}
 
 

@@ -10,6 +10,7 @@ import pytest
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.profile.settings import SafetySettings as Limits
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS, View
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import State
@@ -103,14 +104,15 @@ def test_each_fault_is_detected_and_named(fault):
 
 
 def test_limits_of_missing_servos_or_sensors_are_ignored():
-    state = sound()
-    for fault in ("stale", "alert", "past", "fast", "hot", "brown-out"):
-        put(state, FAULTS[fault][0])
-    assert judged(safety(has_servos=False), state, 1.0) == ("", "")
-    state = sound()
-    for fault in ("no frames", "force", "rim"):
-        put(state, FAULTS[fault][0])
-    assert judged(safety(has_sensors=False), state, 1.0) == ("", "")
+    for missing, faults in (
+        ("servos", ("stale", "alert", "past", "fast", "hot", "brown-out")),
+        ("tactile", ("no frames", "force", "rim")),
+    ):
+        state = sound()
+        for fault in faults:
+            put(state, FAULTS[fault][0])
+        settings = Settings.model_validate({missing: {"backend": "none"}})
+        assert judged(safety(settings), state, 1.0) == ("", "")
 
 
 def test_a_short_spike_of_a_condition_that_must_last_is_not_a_fault():
@@ -359,7 +361,7 @@ def test_a_fault_starts_at_its_limit_and_nan_exceeds_it(name, finger, share):
     value = share * bound
     put(state, {path.format(finger): state.t - value if "silent" in name else value})
     (row,) = (row for row in LIMITS if row.name == name and row.level == "fault")
-    assert bool(row.check(View(SETTINGS), state, row.fraction)) != (share < 1.0)
+    assert bool(row.check(View(SETTINGS, GraspState(), ()), state, row.fraction)) != (share < 1.0)
 
 
 def test_every_row_is_unique_per_level_and_its_settings_exist():

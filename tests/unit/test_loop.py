@@ -9,23 +9,20 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.types import Frame
-from softfinger.daemon.wire.schema import STATE
-from tests.harness.golden_wire import message_maker
 from tests.harness.loop import (
     Make,
     advance_to,
+    armed,
     change_frames,
     command,
     grasped,
     heard,
     refusal,
     silence,
+    state_message,
     torque_of,
 )
-
-state_message = message_maker(STATE)
 
 
 def test_start_up_is_disarmed_without_torque_and_arming_causes_no_motion(make):
@@ -164,10 +161,8 @@ def test_tare_is_refused_during_contact(make):
 
 
 def test_the_state_contains_the_goals_of_the_grip(make):
-    daemon = make()
+    daemon = armed(make())
     goal = daemon.loop.state.goal
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
     assert math.isnan(goal.force)
     command(daemon, "grasp", force=8.0)
     daemon.loop.advance(0.01)
@@ -176,7 +171,7 @@ def test_the_state_contains_the_goals_of_the_grip(make):
     advance_to(daemon, "holding", 5.0)
     command(daemon, "rotate", angle=0.1)
     daemon.loop.advance(0.01)
-    message = state_message(daemon.loop.state, parts(daemon.settings))
+    message = state_message(daemon)
     assert (message["goal_force"], message["goal_angle"]) == (8.0, 0.1)
     advance_to(daemon, "holding", 5.0)
     daemon.loop.advance(1.0)
@@ -377,8 +372,7 @@ def test_stop_works_in_every_mode_within_one_tick(make):
             loop.advance(loop.period)
             assert (state.mode, torque_of(daemon).any()) == ("disarmed", False), steps[upto - 1]
             loop.advance(0.5)
-    command(daemon, "arm")
-    loop.advance(0.1)
+    armed(daemon)
     assert command(daemon, "status")["limited"]["goal.slew"] > 0
     loop._fail("made up")
     loop.advance(loop.period)

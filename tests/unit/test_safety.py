@@ -67,7 +67,7 @@ def test_a_distant_goal_is_approached_at_its_velocity_and_a_near_one_immediately
 
 def test_goals_in_position_mode_do_not_jump():
     settings = Settings.model_validate({"servos": {"mode": "position"}})
-    judge, state = Safety(settings, True, True), sound()
+    judge, state = safety(settings), sound()
     step = settings.safety.goal_speed / settings.loop.rate
     assert bounded(judge, state, goal((0.4, 0.0), (0.0, 0.0))).q[0] == pytest.approx(step)
 

@@ -7,14 +7,9 @@ import pytest
 from softfinger.daemon.control.task import Task
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
-from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Event, Reading
-from softfinger.daemon.wire.schema import STATE
-from tests.harness.golden_wire import message_maker
-from tests.harness.loop import advance_to, command, grasped, heard, refusal
-
-state_message = message_maker(STATE)
+from tests.harness.loop import advance_to, command, grasped, heard, refusal, state_message
 
 
 def holding_demo(daemon: Daemon) -> list[Event]:
@@ -99,8 +94,8 @@ SCENES: dict[str, dict[str, Any]] = {
 def test_every_scene_runs_with_messages_of_the_same_form(make, sections):
     daemon = make(**sections)
     daemon.loop.advance(2.0)
-    message = state_message(daemon.loop.state, parts(daemon.settings))
-    reference = state_message(make().loop.state, parts(daemon.settings))
+    message = state_message(daemon)
+    reference = state_message(make())
     assert message.keys() == reference.keys()
     for part in ("left", "right", "object"):
         assert message[part].keys() == reference[part].keys()

@@ -11,14 +11,12 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.types import Reading
 from tests.conftest import until
 from tests.harness.gateway import Served
-from tests.harness.loop import advance_to, command, grasped, heard, refusal, torque_of
+from tests.harness.loop import advance_to, armed, command, grasped, heard, refusal, torque_of
 from tests.harness.safety import bounded
 
 
 def test_a_non_finite_goal_is_a_fault_even_after_a_refused_command(make):
-    daemon = make()
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
+    daemon = armed(make())
     daemon.loop.state.goal.q[0] = math.nan
     bounded(daemon.loop._safety, daemon.loop.state)
     assert "a goal that is not a finite number" in refusal(daemon, "grasp")
@@ -43,8 +41,7 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
     """Lose all writes; successful reads keep the servos' watchdogs from tripping."""
     daemon = make()
     events = heard(daemon)
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
+    armed(daemon)
     lost = Deaf(daemon)
     assert command(daemon, "stop")["torque_off"] == "unconfirmed"
     assert daemon.loop.state.torque
@@ -68,9 +65,7 @@ def test_unconfirmed_torque_off_is_repeated_until_the_bus_is_silenced(make):
 
 
 def test_without_a_watchdog_the_bus_is_not_silenced(make):
-    daemon = make(servos={"watchdog": 0.0})
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
+    daemon = armed(make(servos={"watchdog": 0.0}))
     lost = Deaf(daemon)
     command(daemon, "stop")
     daemon.loop.advance(0.3)
@@ -82,9 +77,7 @@ def test_without_a_watchdog_the_bus_is_not_silenced(make):
 
 
 def test_torque_off_is_tried_repeatedly_at_exit(make):
-    daemon = make()
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
+    daemon = armed(make())
     lost = Deaf(daemon, tries=5)
     daemon.loop.run(0.0)
     assert lost.tries == 6
@@ -186,9 +179,7 @@ def test_a_stop_by_signal_precedes_waiting_commands_and_prevents_them_from_armin
 
 
 def test_arm_waits_until_torque_off_is_confirmed(make):
-    daemon = make()
-    command(daemon, "arm")
-    daemon.loop.advance(0.1)
+    daemon = armed(make())
     Deaf(daemon, tries=3)
     command(daemon, "stop")
     assert "arm: the servos have not yet confirmed that torque is off" in refusal(daemon, "arm")

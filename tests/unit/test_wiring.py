@@ -15,7 +15,7 @@ from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.types import State
 from softfinger.kinematics.estimation.invalid import Invalid
-from tests.harness.loop import command, heard
+from tests.harness.loop import armed, command, heard
 
 # Signs and offsets [rad] of the readings of both joints.
 JOINTS = {
@@ -74,9 +74,7 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
                 closing(Daemon(Settings.model_validate(values), wire=False))
             )
             daemon.loop.advance(0.2)
-            command(daemon, "arm")
-            daemon.loop.advance(0.1)
-            return daemon
+            return armed(daemon)
 
         yield make
 

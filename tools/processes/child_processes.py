@@ -19,8 +19,6 @@ from typing import Any
 
 from softfinger.daemon.errors import SoftfingerError
 
-# This sequence restores the terminal if the monitor was killed.
-RESTORE_TERMINAL = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _RECORDER_TIMEOUT = 20.0  # time limit for a recorder to subscribe or to close its file [s]
 
 
@@ -97,9 +95,11 @@ class MonitorProcess:
                 end()
         # A killed monitor leaves its page on the screen.
         if self.process.wait() < 0 and self._attributes is not None:
+            from softfinger.tools.terminal.terminal import LEAVE  # slow import, rarely needed
+
             with contextlib.suppress(OSError, termios.error):
                 termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
-                os.write(self._terminal, RESTORE_TERMINAL.encode())
+                os.write(self._terminal, LEAVE.encode())
 
     def __enter__(self) -> MonitorProcess:
         return self

@@ -16,10 +16,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from softfinger.daemon.loop.warm_up import (
     ALL,
@@ -31,12 +31,11 @@ from softfinger.daemon.loop.warm_up import (
     parts,
 )
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import EventSink
 from softfinger.kinematics.compiled.kernel import why_plain
 from softfinger.kinematics.compiled.kernel_folder import kernel_folder, remove_damaged
 from softfinger.tools.arguments import add_profile, profile
 from softfinger.tools.sweep import Progress, processors
-
-Tell = Callable[[str, str, str], None]
 
 _ROOT = Path(__file__).parents[3]
 _MEMORY_MAX = 400e6  # upper bound on the memory use per process [bytes]
@@ -51,25 +50,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compile the missing kernels. Return 1 if a kernel could not be compiled.
+    """Compile the missing kernels. Return 1 if a kernel could not be compiled or stored.
 
     Raises
     ------
     SettingsError
     """
-    built = build_kernels(profile(arguments), print_event, ALL if arguments.all else None)
-    if built.failed:
+    if not build_kernels(profile(arguments), print_event, ALL if arguments.all else None):
         return 1
-    if not built.parts:
-        print("all kernels are compiled")
+    print("all kernels are compiled")
     return 0
-
-
-class Built(NamedTuple):
-    """Number of parts that were missing, and True if any of these parts could not be built."""
-
-    parts: int
-    failed: bool
 
 
 def print_event(_level: str, _kind: str, text: str) -> None:
@@ -78,14 +68,14 @@ def print_event(_level: str, _kind: str, text: str) -> None:
 
 
 def build_kernels(
-    settings: Settings, tell: Tell, wanted: Sequence[Part] | None = None, bar: bool = True
-) -> Built:
+    settings: Settings, tell: EventSink, wanted: Sequence[Part] | None = None, bar: bool = True
+) -> bool:
     """Build the missing parts in ``wanted``, or all missing parts of the scene by default.
 
-    If all parts exist, the function returns quickly without a message. If standard error is a
-    terminal and ``bar`` is set, a bar shows the progress. Without a bar, ``tell(level, kind,
-    text)`` is called for each part. Failures are also passed to ``tell``. An interrupt ends all
-    processes.
+    Return False if a part could not be built or stored. If all parts exist, the function returns
+    quickly without a message. If standard error is a terminal and ``bar`` is set, a bar shows the
+    progress. Without a bar, ``tell(level, kind, text)`` is called for each part. Failures are also
+    passed to ``tell``. An interrupt ends all processes.
     """
     folder = kernel_folder()
     if folder is not None and (count := remove_damaged(folder)):
@@ -93,14 +83,14 @@ def build_kernels(
         tell("warning", "compile", text)
     missing = [part for part in wanted or parts(settings) if not is_built(part, settings)]
     if not missing:
-        return Built(0, False)
+        return True
     if folder is None:
-        tell(
-            "warning",
-            "compile",
-            "compiling the kernels in this process, which takes about half a minute",
+        text = (
+            "the kernels can't be stored, so each process compiles the kernels that it uses, which "
+            "takes about half a minute"
         )
-        return Built(0, False)
+        tell("warning", "compile", text)
+        return False
     if why_plain:
         tell(
             "info", "compile", f"compiling with Numba alone, which takes twice as long: {why_plain}"
@@ -112,7 +102,7 @@ def build_kernels(
     build.run()
     if not build.failed:
         tell("info", "compile", f"compiled in {time.monotonic() - started:.1f} s")
-    return Built(len(missing), build.failed)
+    return not build.failed
 
 
 def _available() -> float:
@@ -127,7 +117,7 @@ def _available() -> float:
 class _Build:
     """Build pipeline parts in several processes, each controlled by its own thread."""
 
-    def __init__(self, settings: Settings, missing: list[Part], tell: Tell, bar: bool) -> None:
+    def __init__(self, settings: Settings, missing: list[Part], tell: EventSink, bar: bool) -> None:
         self._head = f"{settings.model_dump_json()}\n"
         self._missing = missing
         self._at: dict[str, str] = {}  # for each part, the kernel that is being compiled

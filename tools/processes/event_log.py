@@ -26,8 +26,7 @@ from softfinger.daemon.own_files import write_text
 # Maximum number of lines queued for a slow reader. If the queue is full, the oldest line is
 # dropped.
 _LINE_COUNT_MAX = 1000
-_PRIORITIES = {"error": "<3>", "warning": "<4>", "": "<6>", "info": "<6>"}  # see sd-daemon(3)
-_LEVELS = {logging.DEBUG: "info", logging.INFO: "info", logging.WARNING: "warning"}
+_PRIORITIES = {"error": "<3>", "warning": "<4>", "info": "<6>"}  # see sd-daemon(3)
 
 
 class EventLog:
@@ -53,24 +52,17 @@ class EventLog:
         self._thread.start()
 
     def line(self, level: str, kind: str, text: str, **fields: Any) -> None:
-        """Queue one line. The ``fields`` appear only in JSON logs."""
+        """Queue one line. The ``fields`` appear only in JSON logs.
+
+        Without a ``kind``, plain logs show the ``text`` unchanged.
+        """
         if not self.quiet or self._file is not None:
             self._lines.append((time.time(), level, kind, text, fields))
             self._news.set()
 
-    def plain(self, text: str, level: str = "") -> None:
-        """Queue one line without a kind; plain logs show the line unchanged.
-
-        In JSON logs, an empty ``level`` becomes ``info``.
-        """
-        self._lines.append((time.time(), level, "", text, {}))
-        self._news.set()
-
     def take_over_logging(self) -> None:
         """Log the warnings and errors that any module sends to Python's logging."""
-        handler = _LogHandler(self)
-        handler.setLevel(logging.WARNING)
-        logging.getLogger().addHandler(handler)
+        logging.getLogger().addHandler(_LogHandler(self))
 
     def close(self, patience: float = 1.0) -> None:
         """Write the queued lines, and wait at most ``patience`` s until they are written."""
@@ -95,7 +87,7 @@ class EventLog:
         self, timestamp: float, level: str, kind: str, text: str, fields: dict[str, Any]
     ) -> str:
         if self._json:
-            record = {"timestamp": timestamp, "level": level or "info", "kind": kind, "text": text}
+            record = {"timestamp": timestamp, "level": level, "kind": kind, "text": text}
             shown = json.dumps(record | fields, ensure_ascii=False)
         elif not kind:
             shown = text
@@ -129,14 +121,14 @@ def _is_journal() -> bool:
 
 
 class _LogHandler(logging.Handler):
-    """Forward Python's logging to an event log."""
+    """Forward the warnings and errors of Python's logging to an event log."""
 
     def __init__(self, log: EventLog) -> None:
-        super().__init__()
+        super().__init__(logging.WARNING)
         self._log = log
 
     def emit(self, record: logging.LogRecord) -> None:
-        level = _LEVELS.get(record.levelno, "error")
+        level = "warning" if record.levelno < logging.ERROR else "error"
         try:
             self._log.line(level, record.name.rpartition(".")[2], record.getMessage())
         except Exception:  # A logging error must not stop the caller.

@@ -113,7 +113,7 @@ def _serve(
     try:
         daemon = Daemon(settings, on_event=on_event)
     except (SoftfingerError, ValueError) as error:
-        log.plain(f"softfinger: {error}", "error")
+        log.line("error", "", f"softfinger: {error}")
         # systemd does not restart the service after exit status 2.
         return 2 if isinstance(error, SettingsError) else 1
     with daemon, _service(daemon.loop), RealTime(settings) as measures:
@@ -134,7 +134,7 @@ def _serve(
             try:
                 recording = _record(arguments, settings, daemon)
             except RecorderError as error:
-                log.plain(f"softfinger: {error}")
+                log.line("error", "", f"softfinger: {error}")
                 return 1
         page: AbstractContextManager[Any] = nullcontext()
         log.quiet = arguments.monitor  # From this point on, the page uses the terminal.
@@ -146,9 +146,9 @@ def _serve(
         log.quiet = False
     if recording is not None:
         for line in recording.close().splitlines():
-            log.plain(line)
+            log.line("info", "", line)
         if recording.failed:
-            log.plain(f"softfinger: the recording {arguments.record} is incomplete", "error")
+            log.line("error", "", f"softfinger: the recording {arguments.record} is incomplete")
     state, statistics = daemon.loop.state, daemon.loop.statistics
     if statistics.ticks:
         counts = {"ticks": statistics.ticks, "overruns": state.timing.overruns}
@@ -156,11 +156,11 @@ def _serve(
         text = ", ".join(f"{count} {name}" for name, count in counts.items())
         log.line("info", "end", text, **counts, **spreads)
         if arguments.log == "plain":
-            log.plain("\n".join(statistics.table()))
+            log.line("info", "", "\n".join(statistics.table()))
     if state.fault:
-        log.plain(f"softfinger: exited with a fault: {state.fault}", "error")
+        log.line("error", "", f"softfinger: exited with a fault: {state.fault}")
     if state.torque:
-        log.plain("softfinger: torque could not be switched off and may still be on", "error")
+        log.line("error", "", "softfinger: torque could not be switched off and may still be on")
     unrecorded = recording is not None and recording.failed
     return 1 if state.fault or state.torque or unrecorded else 0
 
@@ -176,7 +176,6 @@ def _service(loop: Any) -> Iterator[None]:
     try:
         yield
     finally:
-        service.stopping()
         service.close()
 
 

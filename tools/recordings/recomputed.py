@@ -94,12 +94,22 @@ def recorded_models(recording: MessageSource) -> tuple[FingerModel, FingerModel]
     ------
     RecordingError, SettingsError, TactileError
     """
-    settings, calibrations = recorded_settings(recording)
-    from softfinger.daemon.loop.process_replay import with_calibrations
+    return _models(*recorded_settings(recording))
+
+
+def _models(settings: Settings, calibrations: list[str]) -> tuple[FingerModel, FingerModel]:
+    """Create the finger models from settings and from the JSON text of each calibration."""
     from softfinger.daemon.perception.finger_model import make_models
 
     with tempfile.TemporaryDirectory() as folder:
-        return make_models(with_calibrations(settings, calibrations, Path(folder)))
+        files = ["", ""]
+        for finger, text in enumerate(calibrations):
+            if text:
+                path = Path(folder) / f"{FINGERS[finger]}.json"
+                path.write_text(text, encoding="utf-8")
+                files[finger] = str(path)
+        tactile = settings.tactile.model_copy(update={"calibration": (files[0], files[1])})
+        return make_models(settings.model_copy(update={"tactile": tactile}))
 
 
 def counts_of(
@@ -164,7 +174,7 @@ def _run(
     from softfinger.daemon.loop.process_replay import ProcessReplay
     from softfinger.daemon.loop.publishing import parts
 
-    machine = ProcessReplay(used, calibrations)
+    machine = ProcessReplay(used, _models(used, calibrations))
     scene = parts(used)
     pack_state = packer(schema.STATE)
     newest = [0, 0]

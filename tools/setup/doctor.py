@@ -29,7 +29,7 @@ from softfinger.daemon.diagnosis.ports import (
 from softfinger.daemon.diagnosis.register_file import restore_registers, save_registers
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.profile.validation import plausibility_warnings
+from softfinger.daemon.profile.validation import device_ports, plausibility_warnings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
 from softfinger.daemon.types import FINGERS
@@ -87,31 +87,33 @@ def results(
     settings: Settings, fix: bool, save: Path | None = None, restore: Path | None = None
 ) -> Iterator[Finding]:
     """Perform the requested repairs, then run all checks in the order of their dependencies."""
-    ports = _ports(settings)
+    ports = device_ports(settings)
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
     yield note_ports()
     yield check_runtime_folder()
     running = daemon_mode(settings.commands.address, settings.access.keys) if ports else ""
-    free = {}
+    free = {}  # maps the settings key of each port to True if the port is free
     for key, path in ports:
         found = check_port(path, key, running)
-        free[path] = found.status == "pass"
+        free[key] = found.status == "pass"
         yield found
-        if free[path]:
-            yield from _latency(settings, path, fix)
-    if free.get(settings.servos.port):
+        if free[key]:
+            # A board sends frames unprompted, so the latency timer merely delays the frames. With a
+            # timeout of 1 s, every latency timer is acceptable.
+            timeout = settings.servos.reply_timeout if key == "servos.port" else 1.0
+            yield from _latency(path, timeout, fix)
+    if free.get("servos.port"):
         yield from _register_files(settings, save, restore)
-    yield from _servos(settings, free, fix)
+    yield from _servos(settings, free.get("servos.port", False), fix)
     for warning in plausibility_warnings(settings):
         yield Finding("warn", "settings", warning)
     tactile = settings.tactile
     if not backend("tactile", tactile.backend).metal:
         yield Finding("note", "tactile", f"{tactile.backend}: there is no board to check")
     else:
-        for name in settings.scene.fingers:
-            finger = FINGERS.index(name)
-            if free.get(tactile.port[finger], True):
+        for finger in settings.scene.indices:
+            if free.get(f"tactile.port ({FINGERS[finger]})", True):
                 yield check_board(settings, finger)
             yield check_law(settings, finger)
     yield from check_machine()
@@ -133,33 +135,17 @@ def _register_files(
         yield Finding("FAIL", "servos", str(error))
 
 
-def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """Return the settings key and path of each required port, except the ports of plugins."""
-    ports = []
-    servos = backend("servos", settings.servos.backend)
-    tactile = backend("tactile", settings.tactile.backend)
-    if servos.metal and not servos.source:
-        ports.append(("servos.port", settings.servos.port))
-    if tactile.metal and not tactile.source:
-        for name in settings.scene.fingers:
-            ports.append(("tactile.port", settings.tactile.port[FINGERS.index(name)]))
-    return ports
-
-
-def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
+def _latency(path: str, timeout: float, fix: bool) -> Iterator[Finding]:
     if fix:
         repaired = repair_latency_timer(path)
         if repaired is not None:
             yield repaired
-    servos = path == settings.servos.port
-    # A board sends frames unprompted, so the latency timer merely delays the frames. With a timeout
-    # of 1 s, every latency timer is acceptable.
-    found = check_latency_timer(path, settings.servos.reply_timeout if servos else 1.0)
+    found = check_latency_timer(path, timeout)
     if found is not None:
         yield found
 
 
-def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Finding]:
+def _servos(settings: Settings, port_is_free: bool, fix: bool) -> Iterator[Finding]:
     servos = settings.servos
     found = backend("servos", servos.backend)
     if not found.metal:
@@ -172,7 +158,7 @@ def _servos(settings: Settings, free: dict[str, bool], fix: bool) -> Iterator[Fi
         )
         yield Finding("note", "servos", text)
         return
-    if not free[servos.port]:
+    if not port_is_free:
         return
     if fix:
         yield from repair_servos(settings)

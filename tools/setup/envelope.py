@@ -9,7 +9,7 @@ import argparse
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +47,7 @@ _COLOURS = {HELD: "#009E73", TURNED: "#E69F00", LOST: "#D55E00", REFUSED: "#7777
 class Cell(NamedTuple):
     """Result of one grasp."""
 
-    outcome: str  # key in MEANING
+    outcome: str  # key in OUTCOME_TEXTS
     turned: float  # maximum object rotation [rad]
 
 
@@ -104,7 +104,12 @@ def run(arguments: argparse.Namespace) -> int:
     )
     found: dict[str, list[list[Cell]]] = {shape: [] for shape in shapes}
     frictions, masses, sizes = axes
-    results = sweep(settings, shapes, axes, arguments)
+    build_kernels(settings, print_event)
+    keep: Path | None = arguments.keep
+    journal = None if keep is None else keep.with_name(keep.name + ".part")
+    work = partial(grasped, settings.model_dump(exclude_unset=True), arguments.force)
+    grasps = Sweep("envelope", work, list(itertools.product(shapes, *axes)), journal)
+    results = grasps.run(arguments.processes, arguments.scheduler)
     for shape, friction, mass in itertools.product(shapes, frictions, masses):
         if not found[shape]:
             print(f"\n{shape}, width [mm]:".ljust(28) + "".join(f"{each:>5g}" for each in sizes))
@@ -112,49 +117,26 @@ def run(arguments: argparse.Namespace) -> int:
         found[shape].append(row)
         cells = "".join(f"{cell.outcome:>5}" for cell in row)
         print(f"friction {friction:g}, {mass:g} kg".ljust(27) + cells, flush=True)
-    if arguments.keep:
-        _keep(arguments.keep, settings, arguments.force, axes, found)
-        _journal(arguments.keep).unlink()
+    if keep is not None and journal is not None:
+        _keep(keep, settings, arguments.force, axes, found)
+        journal.unlink()
     if arguments.plot:
         _draw(arguments.plot, arguments.force, axes, found)
     return 0
 
 
-def sweep(
-    settings: Settings,
-    shapes: tuple[str, ...],
-    axes: tuple[tuple[float, ...], ...],
-    arguments: argparse.Namespace,
-) -> Iterator[Cell]:
-    """Yield the result of each grasp. Size varies fastest, then mass, friction and shape."""
-    build_kernels(settings, print_event)
-    journal = _journal(arguments.keep) if arguments.keep else None
-    cases = list(itertools.product(shapes, *axes))
-    work = partial(_one, settings.model_dump(exclude_unset=True), arguments.force)
-    return Sweep("envelope", work, cases, journal).run(arguments.processes, arguments.scheduler)
-
-
-def _journal(keep: Path) -> Path:
-    return keep.with_name(keep.name + ".part")
-
-
-def _one(sections: dict[str, Any], force: float, case: tuple[str, float, float, float]) -> Cell:
-    shape, friction, mass, size = case
-    return grasped(Settings.model_validate(sections), shape, 1e-3 * size, friction, mass, force)
-
-
-def grasped(
-    settings: Settings, shape: str, size: float, friction: float, mass: float, force: float
-) -> Cell:
+def grasped(sections: dict[str, Any], force: float, case: tuple[str, float, float, float]) -> Cell:
     """Grasp an object on the table, then apply a force equal to its weight, away from the palm.
 
-    The daemon's settings contain the object's width or diameter (``size`` [m]), friction and weight
-    (from ``mass`` [kg]). The settings do not contain the ``shape``; the daemon assumes a block.
+    ``sections`` are the settings of the hand. ``case`` contains the object's shape, friction,
+    mass [kg], and width or diameter [mm]. The daemon's settings contain all of these values except
+    the shape; the daemon assumes a block.
     """
     from softfinger.tools.simulated_daemon import SimulatedDaemon
 
-    weight = mass * GRAVITY
-    changed: dict[str, dict[str, Any]] = settings.model_dump(exclude_unset=True)
+    settings = Settings.model_validate(sections)
+    shape, friction, mass, millimetres = case
+    size, weight = 1e-3 * millimetres, mass * GRAVITY
     changes: dict[str, dict[str, Any]] = {
         "simulation": {
             "object_shape": shape,
@@ -166,9 +148,8 @@ def grasped(
         "object": {"width": size, "width_min": min(settings.object.width_min, 0.25 * size)},
         "control": {"tip_friction": friction, "object_load": weight},
     }
-    for name, values in changes.items():
-        changed[name] = changed.get(name, {}) | values
-    with SimulatedDaemon(changed) as hand:
+    changed = {name: sections.get(name, {}) | values for name, values in changes.items()}
+    with SimulatedDaemon(sections | changed) as hand:
         hand.grasp(force)
         angle = float(hand.plant.object_pose[2])
         hand.run(_SETTLING_TIME)

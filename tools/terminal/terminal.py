@@ -25,7 +25,7 @@ with contextlib.suppress(ModuleNotFoundError):  # On Windows, only `monitor --pl
 
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor, bracketed paste
 # This sequence begins with CAN, which ends an incomplete escape sequence.
-_LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
+LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, if supported by the terminal
 
 _COLOUR_SYSTEMS = {
@@ -113,7 +113,7 @@ class Terminal:
                 termios.tcflush(self._output, termios.TCOFLUSH)
             # Resume a terminal that was stopped by Ctrl-S; otherwise the next write would block.
             termios.tcflow(self._output, termios.TCOON)
-            self._write(_LEAVE)
+            self._write(LEAVE)
 
     def size(self) -> tuple[int, int]:
         """Return the size as (columns, lines)."""
