@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from softfinger.daemon.backends import backend, servo_model
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
@@ -150,8 +151,12 @@ def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
 
     from softfinger.daemon.profile.factory import make_material
 
+    try:
+        law = make_material(settings.material)
+    except SettingsError:  # `_material` reports the error.
+        return
     strain = np.linspace(0.0, 0.99, 1000)
-    weighted = make_material(settings.material).stress(strain) / (1.0 - strain) ** 3
+    weighted = law.stress(strain) / (1.0 - strain) ** 3
     height = settings.tip.radius * (1.0 - strain)
     forces = 2.0 * math.pi * height**2 * np.cumsum(weighted) * strain[1]
     for key, force in _set_forces(settings):
@@ -325,16 +330,14 @@ def _material(settings: Settings) -> Iterator[str]:
             f"expected {len(material.strain)} as in material.strain"
         )
         return
-    from softfinger.daemon.profile.factory import law_problem
-    from softfinger.kinematics.contact.material import Material
+    from softfinger.daemon.profile.factory import law_problem, make_material
 
     try:
-        law = Material.from_points(material.strain, material.stress)
-    except ValueError as error:
-        yield f"material.strain, material.stress: {error}"
+        law = make_material(material)
+    except SettingsError as error:
+        yield str(error)
         return
-    problem = law_problem(law, material.force_error_max)
-    if problem:
+    if problem := law_problem(law, material.force_error_max):
         yield f"material.strain, material.stress: {problem}"
 
 
