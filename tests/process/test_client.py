@@ -427,6 +427,8 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
         monkeypatch.setenv("SOFTFINGER_ADDRESS", wrong)
         with pytest.raises(SettingsError, match=r"SOFTFINGER_ADDRESS: found .*, expected tcp://H"):
             Hand()
+        with Hand(*addresses) as hand:  # The environment variable is not read.
+            assert (hand.stream_address, hand.command_address) == addresses
 
 
 UNKNOWN = "unknown host 'no..host' (not a host name); expected an IP address or a"
