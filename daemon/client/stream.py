@@ -104,22 +104,22 @@ class Gaps:
             if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
                 return True
             place = seq // step
-        source, again = message.get("finger"), message.get("again")
-        key = source if isinstance(source, str) else ""
-        last = self._last.get(key)
-        if again is True and last is not None and place <= last:
+        finger, again = str(message.get("finger")), message.get("again")
+        last = self._last.get(finger, place - 1)
+        is_older = place <= last
+        if again is True and is_older:
             if place in self._received:
                 return False
             self._received.append(place)
             self.lost = max(self.lost - 1, 0)
             return True
         if again is not None:
-            if last is not None and place <= last:
+            if is_older:
                 self._received.clear()  # The stored numbers belong to another daemon.
             self._received.append(place)
-        if last is not None and place > last:
+        if not is_older:
             self.lost += place - last - 1
-        self._last[key] = place
+        self._last[finger] = place
         return True
 
 
