@@ -130,9 +130,10 @@ def _examined(
     if directory is not None:
         settings = _with_directory(settings, directory)
     found += _without_words((*problems(settings), *_plugin_problems(settings)), unused)
-    errors = [
-        f"{'--set' if problem.split(':')[0] in changed else name}: {problem}" for problem in found
-    ]
+    errors = []
+    for problem in found:
+        key = problem.partition(":")[0].partition(" (")[0]  # without the name of a finger
+        errors.append(f"{'--set' if key in changed else name}: {problem}")
     return ExaminedProfile(name, settings, errors, unused)
 
 

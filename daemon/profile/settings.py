@@ -35,7 +35,7 @@ from softfinger.daemon.profile.fields import (
     setting,
 )
 from softfinger.daemon.profile.simulation_settings import SimulationSettings
-from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
+from softfinger.daemon.types import COMMAND_ADDRESS, FINGERS, STREAM_ADDRESS
 
 Cells = tuple[tuple[Index, Index], ...]
 
@@ -637,3 +637,24 @@ class Settings(Section):
         """True if the servos and sensors are not real hardware."""
         servos, tactile = self.servos.backend, self.tactile.backend
         return not (backend("servos", servos).metal or backend("tactile", tactile).metal)
+
+    def ports(self, plugins: bool = True) -> list[tuple[str, str]]:
+        """Return the key and the path of each port that the hand needs.
+
+        If ``plugins`` is False, the ports of plugin backends are omitted.
+        """
+        servos = backend("servos", self.servos.backend)
+        tactile = backend("tactile", self.tactile.backend)
+        found = []
+        if servos.metal and (plugins or not servos.source):
+            found.append(("servos.port", self.servos.port))
+        if tactile.metal and (plugins or not tactile.source):
+            for name, port in zip(FINGERS, self.tactile.port, strict=True):
+                if name in self.scene.fingers:
+                    found.append((f"tactile.port ({name})", port))
+        return found
+
+    def addresses(self) -> dict[str, str]:
+        """Return the addresses that the daemon binds, by key."""
+        found = {"stream.address": self.stream.address, "commands.address": self.commands.address}
+        return found | ({"stream.latest": self.stream.latest} if self.stream.latest else {})

@@ -225,16 +225,8 @@ def _servos(settings: Settings) -> Iterator[str]:
 
 def _ports(settings: Settings) -> Iterator[str]:
     """Check that each device has its own port. Plugin ports are not checked."""
-    ports = []
-    servos = backend("servos", settings.servos.backend)
-    tactile = backend("tactile", settings.tactile.backend)
-    if servos.metal and not servos.source:
-        ports.append(("servos.port", settings.servos.port))
-    if tactile.metal and not tactile.source:
-        for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
-            ports.append((f"tactile.port ({FINGERS[finger]})", settings.tactile.port[finger]))
     taken: dict[str, str] = {}
-    for key, port in ports:
+    for key, port in settings.ports(plugins=False):
         place = os.path.realpath(port)
         if place in taken:
             same = "" if place == port else f", a link to {shown(place)}"
@@ -440,12 +432,7 @@ def address_problem(address: str, lacking: str) -> str:
 
 
 def _addresses(settings: Settings) -> Iterator[str]:
-    addresses = {
-        "stream.address": settings.stream.address,
-        "commands.address": settings.commands.address,
-    }
-    if settings.stream.latest:
-        addresses["stream.latest"] = settings.stream.latest
+    addresses = settings.addresses()
     for key, address in addresses.items():
         problem = address_problem(address, "" if settings.access.keys else "access.keys")
         if problem:
@@ -456,12 +443,7 @@ def _addresses(settings: Settings) -> Iterator[str]:
 
 
 def _folder(settings: Settings) -> Iterator[str]:
-    ports = []
-    if backend("servos", settings.servos.backend).metal:
-        ports.append(("servos.port", settings.servos.port))
-    if backend("tactile", settings.tactile.backend).metal:
-        ports += [("tactile.port", port) for port in settings.tactile.port]
-    for key, port in ports:
+    for key, port in settings.ports():
         if "{dir}" in port:
             yield f"{key}: found {shown(port)}, but {{dir}} is not set; pass the folder with --dir"
 

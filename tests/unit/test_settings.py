@@ -336,6 +336,9 @@ def test_command_line_changes_override_the_file_and_are_checked_with_it(tmp_path
         "--set: tip.radios: unknown key; nearest: radius",
         '--set: loop.rate: found "fast", expected a valid number',
     ]
+    real = ["servos.backend=dynamixel", "tactile.backend=flexitac"]
+    with pytest.raises(SettingsError, match=r"^--set: tactile\.port \(right\): found \"/dev/a\""):
+        load(changes=[*real, 'tactile.port=["/dev/a", "/dev/a"]'])
 
 
 @pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1", "loop.rate.x=1"])

@@ -87,7 +87,7 @@ def results(
     settings: Settings, fix: bool, save: Path | None = None, restore: Path | None = None
 ) -> Iterator[Finding]:
     """Perform the requested repairs, then run all checks in the order of their dependencies."""
-    ports = _ports(settings)
+    ports = settings.ports(plugins=False)
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
     yield note_ports()
@@ -131,19 +131,6 @@ def _register_files(
             yield from restore_registers(settings, restore)
     except (ServoError, OSError) as error:
         yield Finding("FAIL", "servos", str(error))
-
-
-def _ports(settings: Settings) -> list[tuple[str, str]]:
-    """Return the settings key and path of each required port, except the ports of plugins."""
-    ports = []
-    servos = backend("servos", settings.servos.backend)
-    tactile = backend("tactile", settings.tactile.backend)
-    if servos.metal and not servos.source:
-        ports.append(("servos.port", settings.servos.port))
-    if tactile.metal and not tactile.source:
-        for name in settings.scene.fingers:
-            ports.append(("tactile.port", settings.tactile.port[FINGERS.index(name)]))
-    return ports
 
 
 def _latency(settings: Settings, path: str, fix: bool) -> Iterator[Finding]:
