@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
 
 
@@ -57,13 +56,9 @@ def make_clock(settings: Settings) -> LoopClock:
 
 def emulated(settings: Settings) -> bool:
     """Return True if all ports belong to a running ``softfinger emulate`` process."""
-    ports = []
-    if backend("servos", settings.servos.backend).metal:
-        ports.append(settings.servos.port)
-    if backend("tactile", settings.tactile.backend).metal:
-        ports += [settings.tactile.port[finger] for finger in settings.scene.indices]
+    ports = settings.ports()
     # The emulator creates its port links and its control socket in the same folder.
-    return bool(ports) and all(Path(port).with_name("control").is_socket() for port in ports)
+    return bool(ports) and all(Path(port).with_name("control").is_socket() for _, port in ports)
 
 
 class Deadline:

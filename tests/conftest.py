@@ -113,10 +113,11 @@ def ended_with_the_test() -> Iterator[None]:
 
 @pytest.fixture
 def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
-    """Yield a ZeroMQ context that drops unsent messages when the test ends."""
+    """Yield a ZeroMQ context whose sockets drop unsent messages when they are closed."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    context.linger = 0
     yield context
-    context.destroy(linger=0)
+    context.destroy()
 
 
 def own_addresses() -> tuple[str, str]:

@@ -28,6 +28,7 @@ from softfinger.daemon.errors import HandClosed, Reason, Refused
 from softfinger.daemon.types import NO_LEASE_COMMANDS
 from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
+from softfinger.daemon.wire.loop_link import machine_time
 
 __all__ = ["HandClient", "NoAnswer", "send"]
 
@@ -36,7 +37,6 @@ _Done = TypeVar("_Done")
 _log = logging.getLogger(__name__)
 
 RETRY_DELAY = 0.05  # delay before a late command is sent again [s]
-_CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux only
 LOCAL_STOP_TIMEOUT = 0.5  # timeout for a stop over the local socket [s]
 # Warning that is logged if ``torque_off`` is ``unconfirmed``.
 UNCONFIRMED_TEXT = "the servos have not yet confirmed that torque is off"
@@ -60,23 +60,15 @@ class Attempts:
         harmless = request.get("command") in NO_LEASE_COMMANDS
         self.request = request if harmless else {**request, "key": secrets.token_hex(8)}
         self.timeout = timeout
-        self._end = _now() + timeout
+        self._end = machine_time() + timeout
 
     def remaining(self) -> float:
         """Return the remaining time [s]."""
-        return max(self._end - _now(), 0.0)
+        return max(self._end - machine_time(), 0.0)
 
     def again(self, reply: dict[str, Any]) -> bool:
         """Return True if the command must be sent again after `RETRY_DELAY` [s]."""
         return reply.get("reason") == Reason.LATE and self.remaining() > 2.0 * RETRY_DELAY
-
-
-def _now() -> float:
-    """Return the monotonic time [s].
-
-    On Linux, the time includes periods in which the computer is suspended.
-    """
-    return time.clock_gettime(_CLOCK) if _CLOCK is not None else time.monotonic()
 
 
 def send(
@@ -200,11 +192,12 @@ class HandClient(Generic[_Done]):
         timeout: float = REPLY_TIMEOUT,
         keys: Path | None = None,
     ) -> None:
-        usual = default_addresses()
-        if stream is not None and commands is None and ("," in stream or is_host(stream)):
-            usual, stream = both_addresses(stream, "address"), None
-        self.stream_address = stream or usual[0]
-        self.command_address = commands or usual[1]
+        if stream and not commands and ("," in stream or is_host(stream)):
+            stream, commands = both_addresses(stream, "address")
+        elif not (stream and commands):
+            usual = default_addresses()
+            stream, commands = stream or usual[0], commands or usual[1]
+        self.stream_address, self.command_address = stream, commands
         for address in (self.stream_address, self.command_address):
             require_host(address)
         self.client = client

@@ -162,13 +162,7 @@ _TIMEOUT = 0.5  # timeout for a daemon's reply [s]
 
 def check_addresses(settings: Settings) -> list[Finding]:
     """Check that all addresses can be bound; report whether a daemon uses an occupied address."""
-    found = [
-        _check(settings, "stream.address", settings.stream.address),
-        _check(settings, "commands.address", settings.commands.address),
-    ]
-    if settings.stream.latest:
-        found.append(_check(settings, "stream.latest", settings.stream.latest))
-    return found
+    return [_check(settings, key, address) for key, address in settings.addresses().items()]
 
 
 def _check(settings: Settings, key: str, address: str) -> Finding:

@@ -37,11 +37,10 @@ class Gateway:
         self._thread = threading.Thread(target=self._watch, name="gateway", daemon=True)
         self._start()
 
-    def wait(self) -> Gateway:
+    def wait(self) -> None:
         """Wait until the gateway is ready. Raises AddressError if the sockets can't be bound."""
         self._connect()
         self._thread.start()
-        return self
 
     def _start(self) -> None:
         ours, theirs = pair()

@@ -27,8 +27,6 @@ Factor = Annotated[float, Field(ge=1e-5, le=1e5, allow_inf_nan=False)]
 Counts = Annotated[int, Field(ge=-1_048_575, le=1_048_575)]
 Modulus = Annotated[float, Field(ge=1, le=1e10, allow_inf_nan=False)]  # Pa
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Ratio = Annotated[float, Field(ge=0.1, le=10)]
-GearLoss = Annotated[float, Field(ge=0, le=0.5)]
 Index = Annotated[int, Field(ge=0, le=255)]
 ServoId = Annotated[int, Field(ge=0, le=252)]
 Processor = Annotated[int, Field(ge=0, le=1023)]

@@ -130,9 +130,10 @@ def _examined(
     if directory is not None:
         settings = _with_directory(settings, directory)
     found += _without_words((*problems(settings), *_plugin_problems(settings)), unused)
-    errors = [
-        f"{'--set' if problem.split(':')[0] in changed else name}: {problem}" for problem in found
-    ]
+    errors = []
+    for problem in found:
+        key = problem.partition(":")[0].partition(" (")[0]  # without the name of a finger
+        errors.append(f"{'--set' if key in changed else name}: {problem}")
     return ExaminedProfile(name, settings, errors, unused)
 
 
@@ -233,9 +234,10 @@ def _change(data: dict[str, Any], change: str) -> str:
     for section in sections:
         held = held.setdefault(section, {})
         if not isinstance(held, dict):
-            break
-    else:
-        held[inner] = value
+            raise SettingsError(
+                f"--set: found {change!r}, but {section} is not a table; expected section.key=value"
+            )
+    held[inner] = value
     return key.strip()
 
 
@@ -291,8 +293,7 @@ def _line(
     location = [*above, *inside]
     key = shown(".".join(location))[1:-1]
     if details["type"] == "extra_forbidden":
-        known = list(_model(inside[:-1], model).model_fields)
-        return f"{key}: unknown key{nearest(location[-1], known)}"
+        return f"{key}: unknown key{nearest(location[-1], _fields(inside[:-1], model))}"
     if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return f"{key}: found {shown(details['input'])}, expected a table"
     expected = _MESSAGE_START.sub("", details["msg"], count=1)
@@ -303,16 +304,20 @@ def _line(
 
 
 def _is_length(location: list[str]) -> bool:
-    extra = _model(location[:1]).model_fields[location[1]].json_schema_extra
+    extra = _fields(location[:1], Settings)[location[1]].json_schema_extra
     return isinstance(extra, dict) and extra.get("unit") == "m"
 
 
-def _model(location: list[str], model: Any = Settings) -> Any:
-    """Return the section class at the path ``location`` within ``model``."""
+def _fields(location: list[str], model: Any) -> dict[str, Any]:
+    """Return the fields of the table at the path ``location`` within ``model``.
+
+    Returns an empty dict if the path leads through a list or an optional table of a plugin.
+    """
     for part in location:
         model = model.model_fields[part].annotation
-        assert issubclass(model, BaseModel)
-    return model
+        if not (isinstance(model, type) and issubclass(model, BaseModel)):
+            return {}
+    return model.model_fields  # type: ignore[no-any-return]
 
 
 def _with_directory(settings: Settings, directory: Path) -> Settings:

@@ -19,7 +19,6 @@ from softfinger.daemon.profile.fields import (
     Factor,
     Finite,
     Fraction,
-    GearLoss,
     Index,
     Length,
     Modulus,
@@ -38,16 +37,13 @@ from softfinger.daemon.profile.fields import (
 from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.types import COMMAND_ADDRESS, FINGERS, STREAM_ADDRESS
 
-Finger = Literal["left", "right"]
 Cells = tuple[tuple[Index, Index], ...]
-LawName = Literal["energy", "upright"]
-ServoMode = Literal["current-based position", "current", "position"]
 
 
 class SceneSettings(Section):
     """Parts of the hand. The backend ``none`` removes the servos or the sensors."""
 
-    fingers: tuple[Finger, ...] = setting(
+    fingers: tuple[Literal["left", "right"], ...] = setting(
         ("left", "right"), "", "Fingers of the hand, one or two.", min_length=1, max_length=2
     )
     object_model: bool = setting(
@@ -157,7 +153,7 @@ class ServoSettings(Section):
     current_limit: tuple[Positive, Positive] = setting(
         (6.0, 6.0), "A", "Maximum goal current; the servo's own limit also applies."
     )
-    mode: ServoMode = setting(
+    mode: Literal["current-based position", "current", "position"] = setting(
         "current-based position", "", "Operating mode of the servos; `position` cannot grasp."
     )
     stiffness: Positive = setting(
@@ -422,7 +418,7 @@ class ControlSettings(Section):
     move_speed: Positive = setting(1.0, "rad/s", "Joint speed during `move` and `release`.")
     contact_force: Positive = setting(0.5, "N", "Force above which a finger is in contact.")
     force_default: Positive = setting(5.0, "N", "Force of a `grasp` without the `force` parameter.")
-    law: LawName = setting(
+    law: Literal["energy", "upright"] = setting(
         "energy", "", "Grip control law; `upright` does not use the measured object angle."
     )
     force_time: Seconds = setting(
@@ -458,9 +454,10 @@ class ControlSettings(Section):
     joint_friction: NonNegative = setting(
         0.05, "N·m", "Coulomb friction that is compensated while the joint is commanded to move."
     )
-    joint_load_friction: GearLoss = setting(
-        0.0, "", "Gear friction as a fraction of the transmitted torque (MX-64 0.23, XL330 0.25)."
-    )
+    joint_load_friction: float = setting(
+        0.0, "", "Gear friction as a fraction of the transmitted torque (MX-64 0.23, XL330 0.25).",
+        ge=0, le=0.5
+    )  # fmt: skip
     friction_speed: Positive = setting(
         0.02, "rad/s", "Commanded speed above which friction is fully compensated."
     )
@@ -645,3 +642,24 @@ class Settings(Section):
         """True if the servos and sensors are not real hardware."""
         servos, tactile = self.servos.backend, self.tactile.backend
         return not (backend("servos", servos).metal or backend("tactile", tactile).metal)
+
+    def ports(self, plugins: bool = True) -> list[tuple[str, str]]:
+        """Return the key and the path of each port that the hand needs.
+
+        If ``plugins`` is False, the ports of plugin backends are omitted.
+        """
+        servos = backend("servos", self.servos.backend)
+        tactile = backend("tactile", self.tactile.backend)
+        found = []
+        if servos.metal and (plugins or not servos.source):
+            found.append(("servos.port", self.servos.port))
+        if tactile.metal and (plugins or not tactile.source):
+            for name, port in zip(FINGERS, self.tactile.port, strict=True):
+                if name in self.scene.fingers:
+                    found.append((f"tactile.port ({name})", port))
+        return found
+
+    def addresses(self) -> dict[str, str]:
+        """Return the addresses that the daemon binds, by key."""
+        found = {"stream.address": self.stream.address, "commands.address": self.commands.address}
+        return found | ({"stream.latest": self.stream.latest} if self.stream.latest else {})

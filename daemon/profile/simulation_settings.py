@@ -15,7 +15,6 @@ from softfinger.daemon.profile.fields import (
     NonNegative,
     Place,
     Positive,
-    Ratio,
     Section,
     names_backend,
     setting,
@@ -114,8 +113,8 @@ class SimulationSettings(Section):
         "",
         "Tangential force law of the tips; with `springs`, the shear force depends on θ.",
     )
-    tip_shear_stiffness: Ratio = setting(
-        1.0, "", "Ratio of tangential to normal stiffness of the tip's springs."
+    tip_shear_stiffness: float = setting(
+        1.0, "", "Ratio of tangential to normal stiffness of the tip's springs.", ge=0.1, le=10
     )
     tip_creep_time: NonNegative = setting(
         0.0,

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from softfinger.daemon.backends import backend, servo_model
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION
 
@@ -150,8 +151,12 @@ def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
 
     from softfinger.daemon.profile.factory import make_material
 
+    try:
+        law = make_material(settings.material)
+    except SettingsError:  # `_material` reports the error.
+        return
     strain = np.linspace(0.0, 0.99, 1000)
-    weighted = make_material(settings.material).stress(strain) / (1.0 - strain) ** 3
+    weighted = law.stress(strain) / (1.0 - strain) ** 3
     height = settings.tip.radius * (1.0 - strain)
     forces = 2.0 * math.pi * height**2 * np.cumsum(weighted) * strain[1]
     for key, force in _set_forces(settings):
@@ -218,23 +223,10 @@ def _servos(settings: Settings) -> Iterator[str]:
         yield f"servos.ids: found {shown(servos.ids)}, expected two different IDs"
 
 
-def device_ports(settings: Settings) -> list[tuple[str, str]]:
-    """Return the settings key and path of each required port, except the ports of plugins."""
-    ports = []
-    servos = backend("servos", settings.servos.backend)
-    tactile = backend("tactile", settings.tactile.backend)
-    if servos.metal and not servos.source:
-        ports.append(("servos.port", settings.servos.port))
-    if tactile.metal and not tactile.source:
-        for finger in settings.scene.indices:
-            ports.append((f"tactile.port ({FINGERS[finger]})", settings.tactile.port[finger]))
-    return ports
-
-
 def _ports(settings: Settings) -> Iterator[str]:
     """Check that each device has its own port. Plugin ports are not checked."""
     taken: dict[str, str] = {}
-    for key, port in device_ports(settings):
+    for key, port in settings.ports(plugins=False):
         place = os.path.realpath(port)
         if place in taken:
             same = "" if place == port else f", a link to {shown(place)}"
@@ -330,16 +322,14 @@ def _material(settings: Settings) -> Iterator[str]:
             f"expected {len(material.strain)} as in material.strain"
         )
         return
-    from softfinger.daemon.profile.factory import law_problem
-    from softfinger.kinematics.contact.material import Material
+    from softfinger.daemon.profile.factory import law_problem, make_material
 
     try:
-        law = Material.from_points(material.strain, material.stress)
-    except ValueError as error:
-        yield f"material.strain, material.stress: {error}"
+        law = make_material(material)
+    except SettingsError as error:
+        yield str(error)
         return
-    problem = law_problem(law, material.force_error_max)
-    if problem:
+    if problem := law_problem(law, material.force_error_max):
         yield f"material.strain, material.stress: {problem}"
 
 
@@ -442,12 +432,7 @@ def address_problem(address: str, lacking: str) -> str:
 
 
 def _addresses(settings: Settings) -> Iterator[str]:
-    addresses = {
-        "stream.address": settings.stream.address,
-        "commands.address": settings.commands.address,
-    }
-    if settings.stream.latest:
-        addresses["stream.latest"] = settings.stream.latest
+    addresses = settings.addresses()
     for key, address in addresses.items():
         problem = address_problem(address, "" if settings.access.keys else "access.keys")
         if problem:
@@ -458,12 +443,7 @@ def _addresses(settings: Settings) -> Iterator[str]:
 
 
 def _folder(settings: Settings) -> Iterator[str]:
-    ports = []
-    if backend("servos", settings.servos.backend).metal:
-        ports.append(("servos.port", settings.servos.port))
-    if backend("tactile", settings.tactile.backend).metal:
-        ports += [("tactile.port", port) for port in settings.tactile.port]
-    for key, port in ports:
+    for key, port in settings.ports():
         if "{dir}" in port:
             yield f"{key}: found {shown(port)}, but {{dir}} is not set; pass the folder with --dir"
 

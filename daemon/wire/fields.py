@@ -67,8 +67,7 @@ class FieldSource(Generic[_From]):
 
         ``prefix`` is prepended to the field descriptions.
         """
-        about = {"unit": "", "meaning": prefix, "source": self, "get": get}
-        return dataclasses.field(metadata=about)
+        return self("", prefix, get)
 
 
 class Member(NamedTuple):

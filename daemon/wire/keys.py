@@ -125,20 +125,13 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
         raise KeyFileError(
             f"{folder}: the server's keys already exist; to add clients, give their names"
         )
-    try:
-        return _write_keys(folder, server, wanted, new)
-    except OSError as error:
-        raise KeyFileError(f"{error.filename or folder}: {error.strerror}") from None
-
-
-def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list[Path]:
     before = os.umask(0o077)
     try:
         (server / "clients").mkdir(parents=True, exist_ok=True)
         _check_above(server / "clients" / "any")
         if new:
             zmq.auth.create_certificates(server, "server")
-        for name in names:
+        for name in wanted:
             client = folder / name
             client.mkdir()
             zmq.auth.create_certificates(client, "client")
@@ -146,9 +139,11 @@ def _write_keys(folder: Path, server: Path, names: list[str], new: bool) -> list
             # Move the public key last, so that the server accepts only clients that have all their
             # keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
+    except OSError as error:
+        raise KeyFileError(f"{error.filename or folder}: {error.strerror}") from None
     finally:
         os.umask(before)
-    return [*([server] if new else []), *(folder / name for name in names)]
+    return [folder / name for name in (["server", *wanted] if new else wanted)]
 
 
 def load_server(folder: Path) -> ServerKeys:
@@ -203,8 +198,19 @@ def _pair(path: Path) -> tuple[bytes, bytes]:
 
 
 def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
+    """Read a key file.
+
+    Raises KeyFileError if another user owns the file, may write to it, or may read a secret key.
+    """
     try:
-        _check(path, path.stat(), secret)
+        status = path.stat()
+        mode = stat.S_IMODE(status.st_mode)
+        if secret and mode & 0o077:
+            raise KeyFileError(
+                f"{path}: other users can read this file ({mode:04o}); run chmod 600 {path}"
+            )
+        if wrong := fault(path, status):
+            raise KeyFileError(wrong)
         keys = zmq.auth.load_certificate(path)
         for key in filter(None, keys):
             if len(zmq.utils.z85.decode(key)) != _LENGTH:
@@ -214,17 +220,6 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
     except (ValueError, LookupError, struct.error):  # struct.error: a value exceeds the Z85 range
         raise KeyFileError(f"{path}: not a key file") from None
     return keys
-
-
-def _check(path: Path, status: os.stat_result, secret: bool = False) -> None:
-    """Raise KeyFileError if another user owns a file, may write to it, or may read a secret key."""
-    mode = stat.S_IMODE(status.st_mode)
-    if secret and mode & 0o077:
-        raise KeyFileError(
-            f"{path}: other users can read this file ({mode:04o}); run chmod 600 {path}"
-        )
-    if wrong := fault(path, status):
-        raise KeyFileError(wrong)
 
 
 def _check_above(path: Path) -> None:

@@ -29,6 +29,7 @@ _BUFFER_SIZE = 1 << 20  # requested socket buffer size [bytes]; the kernel may a
 _CHUNK = 1 << 16  # maximum number of bytes per receive call
 _MESSAGE_SIZE_MAX = 64 << 20  # maximum message size [bytes]
 _NOTICE_COUNT_MAX = 20
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", None)  # Linux only
 _FIRST, _AGAIN = (msgpack.packb("again") + msgpack.packb(again) for again in (False, True))
 
 
@@ -50,8 +51,11 @@ class Ask(NamedTuple):
 
 
 def machine_time() -> float:
-    """Return the monotonic time [s], including time during which the machine was suspended."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
+    """Return the monotonic time [s].
+
+    On Linux, the time includes periods in which the machine is suspended.
+    """
+    return time.monotonic() if _CLOCK is None else time.clock_gettime(_CLOCK)
 
 
 def pair() -> tuple[socket.socket, socket.socket]:

@@ -10,6 +10,7 @@ of topics without subscribers are not packed.
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from functools import partial
@@ -94,7 +95,7 @@ class Publisher:
     def __init__(self, link: Link) -> None:
         self._link = link
         self._pack = {topic: packer(topic) for topic in TOPICS}
-        self._counts = {EVENT: 0, COMMAND: 0, SETTINGS: 0}
+        self._numbers = {topic: itertools.count(1) for topic in (EVENT, COMMAND)}
 
     @property
     def wanted(self) -> int:
@@ -108,19 +109,15 @@ class Publisher:
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""
-        self.send(EVENT, self._count(EVENT), wall, t, level, kind, text)
+        self.send(EVENT, next(self._numbers[EVENT]), wall, t, level, kind, text)
 
     def command(
         self, wall: float, t: float, tick: int, request: dict[str, Any], error: str
     ) -> None:
         """Publish ``hand/command``; ``error`` is the refusal text, or empty."""
         if self._link.wanted & _COMMANDS:
-            self.send(COMMAND, self._count(COMMAND), wall, t, tick, request, error)
+            self.send(COMMAND, next(self._numbers[COMMAND]), wall, t, tick, request, error)
 
     def settings(self, wall: float, t: float, info: HandInfo) -> None:
         """Publish ``hand/settings``, once."""
-        self.send(SETTINGS, self._count(SETTINGS), wall, t, info)
-
-    def _count(self, topic: bytes) -> int:
-        self._counts[topic] += 1
-        return self._counts[topic]
+        self.send(SETTINGS, 1, wall, t, info)

@@ -661,25 +661,21 @@ class TrueFinger:
     """One finger in ``hand/truth``."""
 
     d: float = _true_finger(
-        "m", "maximum displacement, negative for a gap", lambda f: float(f.truth.d[f.i])
+        "m", "maximum displacement, negative for a gap", lambda f: f.truth.d[f.i]
     )
     theta: float = _true_finger(
-        "rad", "tilt: object angle relative to the tip", lambda f: float(f.truth.theta[f.i])
+        "rad", "tilt: object angle relative to the tip", lambda f: f.truth.theta[f.i]
     )
-    force: float = _true_finger("N", "force on the tip's base", lambda f: float(f.truth.force[f.i]))
+    force: float = _true_finger("N", "force on the tip's base", lambda f: f.truth.force[f.i])
 
 
 @record
 class TrueObject:
     """The object in ``hand/truth``."""
 
-    x: float = _true_pose(
-        "m", "x of the object's centre in the hand's frame", lambda p: float(p[0])
-    )
-    y: float = _true_pose(
-        "m", "y of the object's centre in the hand's frame", lambda p: float(p[1])
-    )
-    angle: float = _true_pose("rad", "object angle in the hand's frame", lambda p: float(p[2]))
+    x: float = _true_pose("m", "x of the object's centre in the hand's frame", lambda p: p[0])
+    y: float = _true_pose("m", "y of the object's centre in the hand's frame", lambda p: p[1])
+    angle: float = _true_pose("rad", "object angle in the hand's frame", lambda p: p[2])
 
 
 @topic(TRUTH, "True state of a simulated hand, sent with each `hand/state`.", TruthSource)

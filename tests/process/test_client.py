@@ -277,6 +277,16 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     assert not again.take({"seq": 5, "again": True})
 
 
+def test_the_first_messages_of_a_restarted_daemon_are_not_repetitions():
+    gaps = Gaps()
+    for t in (10, 20):  # time at which each daemon sends its first message
+        for seq in (1, 2):
+            message = {"seq": seq, "again": True, "mono_ns": t + seq}
+            assert gaps.take(message)
+            assert not gaps.take(message)
+    assert gaps.lost == 0
+
+
 def test_an_unknown_schema_is_reported_once_and_known_fields_are_kept(fake, hand):
     fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
     until(lambda: fake.published > 2)
@@ -427,6 +437,8 @@ def test_one_string_names_both_addresses(monkeypatch, named, addresses, given):
         monkeypatch.setenv("SOFTFINGER_ADDRESS", wrong)
         with pytest.raises(SettingsError, match=r"SOFTFINGER_ADDRESS: found .*, expected tcp://H"):
             Hand()
+        with Hand(*addresses) as hand:  # The environment variable is not read.
+            assert (hand.stream_address, hand.command_address) == addresses
 
 
 UNKNOWN = "unknown host 'no..host' (not a host name); expected an IP address or a"

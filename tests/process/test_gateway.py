@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -43,6 +43,14 @@ def own_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     with TemporaryDirectory(prefix="softfinger-") as folder:
         monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
         yield Path(folder) / "softfinger"
+
+
+@pytest.fixture
+def gateway(addresses: Addresses) -> Iterator[Gateway]:
+    """Yield a gateway process without a loop."""
+    with closing(Gateway(Config(*addresses, GATEWAY_TOPICS, 100))) as gateway:
+        gateway.wait()
+        yield gateway
 
 
 @pytest.fixture
@@ -157,43 +165,31 @@ def test_a_hanging_gateway_ends_itself_but_not_on_a_busy_machine(bound, does, st
     assert ended.returncode == status
 
 
-def test_a_stopped_gateway_is_replaced(addresses):
-    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
-    try:
-        stopped = gateway.process.pid
-        os.kill(stopped, signal.SIGSTOP)
-        until(lambda: gateway.process.pid != stopped)
-        assert "the gateway process was suspended" in gateway.link.notices
-    finally:
-        gateway.close()
+def test_a_stopped_gateway_is_replaced(gateway):
+    stopped = gateway.process.pid
+    os.kill(stopped, signal.SIGSTOP)
+    until(lambda: gateway.process.pid != stopped)
+    assert "the gateway process was suspended" in gateway.link.notices
 
 
-def test_gateway_memory_is_bounded_and_its_priority_is_normal(addresses):
-    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
-    try:
-        limits = Path(f"/proc/{gateway.process.pid}/limits").read_text(encoding="ascii")
-        (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
-        assert int(data.split()[3]) <= bounds.MEMORY_MAX
-        (files,) = [line for line in limits.splitlines() if line.startswith("Max open files")]
-        assert int(files.split()[3]) <= bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT
-        assert os.sched_getscheduler(gateway.process.pid) == os.SCHED_OTHER
-    finally:
-        gateway.close()
+def test_gateway_memory_is_bounded_and_its_priority_is_normal(gateway):
+    limits = Path(f"/proc/{gateway.process.pid}/limits").read_text(encoding="ascii")
+    (data,) = [line for line in limits.splitlines() if line.startswith("Max data size")]
+    assert int(data.split()[3]) <= bounds.MEMORY_MAX
+    (files,) = [line for line in limits.splitlines() if line.startswith("Max open files")]
+    assert int(files.split()[3]) <= bounds.CLIENT_COUNT_MAX + bounds.DESCRIPTOR_COUNT
+    assert os.sched_getscheduler(gateway.process.pid) == os.SCHED_OTHER
 
 
-def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(addresses):
-    gateway = Gateway(Config(*addresses, GATEWAY_TOPICS, 100)).wait()
-    try:
-        publisher = Publisher(gateway.link)
-        gateway.link.look()
-        os.kill(gateway.process.pid, signal.SIGSTOP)
-        for k in range(50_000):  # If publishing waited for the gateway, the loop would never end.
-            publisher.event(0.0, 0.0, "info", "test", f"event {k}")
-        assert len(gateway.link._channel._unsent) < 1000, "the queue exceeds its limit"
-        with suppress(ProcessLookupError):  # The daemon may already have killed a slow gateway.
-            os.kill(gateway.process.pid, signal.SIGCONT)
-    finally:
-        gateway.close()
+def test_a_loop_with_a_stopped_gateway_drops_messages_without_waiting(gateway):
+    publisher = Publisher(gateway.link)
+    gateway.link.look()
+    os.kill(gateway.process.pid, signal.SIGSTOP)
+    for k in range(50_000):  # If publishing waited for the gateway, the loop would never end.
+        publisher.event(0.0, 0.0, "info", "test", f"event {k}")
+    assert len(gateway.link._channel._unsent) < 1000, "the queue exceeds its limit"
+    with suppress(ProcessLookupError):  # The daemon may already have killed a slow gateway.
+        os.kill(gateway.process.pid, signal.SIGCONT)
 
 
 # --- local stop -----------------------------------------------------------------------------------

@@ -164,8 +164,9 @@ def guarded(addresses: Addresses, folder: Path) -> Iterator[Guarded]:
 def others() -> Iterator[zmq.Context[Any]]:
     """Return a context for clients, which is separate from the daemon's context, as in practice."""
     others: zmq.Context[Any] = zmq.Context()
+    others.linger = 0
     yield others
-    others.destroy(linger=0)
+    others.destroy()
 
 
 def ask(
@@ -174,7 +175,6 @@ def ask(
     """Return a subscriber, and a socket that has sent a command in another client's name."""
     subscriber, commander = context.socket(zmq.SUB), context.socket(zmq.DEALER)
     for socket, address in zip((subscriber, commander), addresses, strict=True):
-        socket.setsockopt(zmq.LINGER, 0)
         if keys is not None:
             keys.guard(socket)
         if socket is subscriber:
@@ -215,7 +215,6 @@ def test_the_key_identifies_a_client_and_clients_without_a_key_get_nothing(
 
 def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addresses, folder):
     stopper = others.socket(zmq.REQ)
-    stopper.setsockopt(zmq.LINGER, 0)
     load_client(folder / "alice").guard(stopper)
     stopper.connect(addresses[1])
     stopper.send(msgpack.packb({"command": "stop"}))

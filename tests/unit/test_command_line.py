@@ -148,6 +148,15 @@ def test_one_address_suits_every_client(text, stream, commands):
             1,
             ["error: FILE: tip.radius", "FILE: 1 error, 0"],
         ),
+        (
+            'material.law = "points"\nservos.ids = [3, 3]\n',
+            1,
+            [
+                "error: FILE: servos.ids: found [3, 3]",
+                "error: FILE: material.strain, material.stress: the stress-strain points can't be",
+                "FILE: 2 errors, 0 warnings",
+            ],
+        ),
         ("loop = [", 1, ["error: FILE: not TOML", "FILE: 1 error, 0 warnings"]),
         (
             'tactile.calibration = ["absent.json", ""]\n',

@@ -24,7 +24,7 @@ from softfinger.daemon.loop import build
 from softfinger.daemon.loop.loop import command_age_max
 from softfinger.daemon.loop.requests import Command, Lease, parse
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.command_server import decode
+from softfinger.daemon.wire.command_server import Handler, decode
 from tests.conftest import until
 from tests.harness.gateway import Served
 
@@ -39,6 +39,20 @@ def echo(request: dict[str, Any], age: float) -> dict[str, Any]:
 def server(addresses: tuple[str, str]) -> Iterator[Served]:
     with Served(commands=addresses[1]) as served, served.serving(echo):
         yield served
+
+
+class Heard:
+    """Command handler that records the requests."""
+
+    def __init__(self) -> None:
+        self.requests: list[dict[str, Any]] = []
+
+    def __call__(self, request: dict[str, Any], age: float) -> dict[str, Any]:
+        self.requests.append(request)
+        return {}
+
+    def commands(self) -> list[str]:
+        return [request["command"] for request in self.requests]
 
 
 class Asking:
@@ -57,8 +71,9 @@ class Asking:
             request = msgpack.packb({"command": request})
         self.socket.send(request)
 
-    def told(self) -> dict[str, Any]:
-        until(lambda: [self._served.serve(echo), self.socket.poll(0)][1])
+    def told(self, handler: Handler = echo) -> dict[str, Any]:
+        """Serve requests until the reply arrives, and return the reply."""
+        until(lambda: [self._served.serve(handler), self.socket.poll(0)][1])
         return msgpack.unpackb(self.socket.recv())
 
 
@@ -131,17 +146,13 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
 def test_a_request_passes_few_functions(context, addresses):
     """Count the daemon's functions that run for one request, from the socket to the handler."""
     passed: set[str] = set()
-    heard = []
+    heard = Heard()
 
     def note(frame: Any, event: str, _: object) -> None:
         code = frame.f_code
         is_ours = "/daemon/" in code.co_filename
-        if event == "call" and not heard and is_ours and code.co_name[0] != "<":
+        if event == "call" and not heard.requests and is_ours and code.co_name[0] != "<":
             passed.add(code.co_qualname)
-
-    def hear(request: dict[str, Any], age: float) -> dict[str, Any]:
-        heard.append(request)
-        return {}
 
     with Served(commands=addresses[1]) as served:
         asking = Asking(context, served, addresses[1], "arm")
@@ -150,7 +161,7 @@ def test_a_request_passes_few_functions(context, addresses):
         until(served.has_request)
         sys.setprofile(note)
         try:
-            until(lambda: [served.serve(hear), heard][1])
+            until(lambda: [served.serve(heard), heard.requests][1])
         finally:
             sys.setprofile(None)
     assert {"CommandEndpoint.read", "Link.look", "CommandServer.serve"} < passed
@@ -212,7 +223,6 @@ def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered
 ):
     with Served(commands=addresses[1]) as served:
         client = context.socket(zmq.DEALER)
-        client.setsockopt(zmq.LINGER, 0)
         client.connect(addresses[1])
         client.send_multipart(frames)
         until(lambda: [served.serve(echo), client.poll(0)][1])
@@ -261,13 +271,11 @@ def test_age_is_counted_from_before_a_stall_of_either_process(context, addresses
             until(served.has_request)
         pass_time(clock, 0.5)
         # After the stall, libzmq's own thread may run later than the gateway's check.
-        until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
-        assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
+        assert asking.told(aged)["reason"] == "late"
         pass_time(clock, bounds.POLL_GAP_MAX / 2)
         served.serve(aged)
         asking.send("arm")
-        until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
-        assert msgpack.unpackb(asking.socket.recv()) == {"ok": True, "count": 1}
+        assert asking.told(aged) == {"ok": True, "count": 1}
         assert 0.0 <= aged.ages[0] <= bounds.POLL_GAP_MAX
 
 
@@ -280,8 +288,7 @@ def test_a_key_is_executed_once_and_its_reply_repeated(context, addresses):
     with Served(commands=addresses[1], clock=VirtualClock()) as served:
         for key, count in (("a", 1), ("a", 1), ("b", 2), ("a", 1)):
             asking = Asking(context, served, addresses[1], keyed(key=key))
-            until(lambda: [served.serve(aged), asking.socket.poll(0)][1])  # noqa: B023
-            assert msgpack.unpackb(asking.socket.recv()) == {"ok": True, "count": count}
+            assert asking.told(aged) == {"ok": True, "count": count}
 
 
 @pytest.mark.parametrize("meanwhile", ["", "signal", "stop", "disarm", "status"])
@@ -293,8 +300,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         asking = Asking(context, served, addresses[1], keyed())
         on_the_link(served)
         pass_time(clock, 0.5)
-        until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
-        assert msgpack.unpackb(asking.socket.recv())["reason"] == "late"
+        assert asking.told(aged)["reason"] == "late"
         for _ in range(4):  # Wait until the refusal time is over.
             pass_time(clock, bounds.REFUSAL_TIME / 2)
             served.serve(aged)
@@ -307,8 +313,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
         until(lambda: served._is_open())
         count = len(aged.ages)
         asking.send(keyed())
-        until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
-        reply = msgpack.unpackb(asking.socket.recv())
+        reply = asking.told(aged)
         if meanwhile in ("", "status"):
             assert reply == {"ok": True, "count": count + 1}
         else:
@@ -321,8 +326,7 @@ def test_every_disarm_is_executed_even_with_the_same_key(context, addresses):
     with Served(commands=addresses[1], clock=VirtualClock()) as served:
         for count in (1, 2):
             asking = Asking(context, served, addresses[1], keyed("disarm"))
-            until(lambda: [served.serve(aged), asking.socket.poll(0)][1])  # noqa: B023
-            assert msgpack.unpackb(asking.socket.recv()) == {"ok": True, "count": count}
+            assert asking.told(aged) == {"ok": True, "count": count}
 
 
 def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses):
@@ -336,8 +340,7 @@ def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses
         assert served.link.confirmed == 0
         until(lambda: served._is_open())
         asking = Asking(context, served, addresses[1], "arm")
-        until(lambda: [served.serve(aged), asking.socket.poll(0)][1])
-        assert msgpack.unpackb(asking.socket.recv())["ok"]
+        assert asking.told(aged)["ok"]
 
 
 def test_a_setpoint_only_replaces_one_with_the_same_or_fewer_fields(context, addresses):
@@ -363,12 +366,7 @@ def test_a_setpoint_only_replaces_one_with_the_same_or_fewer_fields(context, add
 
 
 def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
-    forces = []
-
-    def note(request: dict[str, Any], age: float) -> dict[str, Any]:
-        forces.append(request["force"])
-        return {}
-
+    heard = Heard()
     with Served(commands=addresses[1], clock=VirtualClock()) as served:
         streams = [context.socket(zmq.DEALER) for _ in range(2)]
         for k, stream in enumerate(streams):
@@ -386,7 +384,8 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
         # Let the gateway receive all setpoints before the loop continues.
         commands = served.service.commands
         until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
-        until(lambda: [served.serve(note), collected()][1])
+        until(lambda: [served.serve(heard), collected()][1])
+        forces = [request["force"] for request in heard.requests]
         assert {19, 119} <= set(forces), "each connection's newest setpoint must be executed"
         assert len(forces) <= 2 * -(-40 // bounds.UNANSWERED_MAX), (
             "older setpoints that wait at the same time must be superseded"
@@ -408,16 +407,10 @@ def test_a_request_that_is_nested_too_deeply_is_reported():
 
 
 def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(context, addresses):
-    heard = []
-
-    def note(request: dict[str, Any], age: float) -> dict[str, Any]:
-        heard.append(request["command"])
-        return {}
-
+    heard = Heard()
     with Served(commands=addresses[1], max_bytes=4096) as served:
         client, stopper = context.socket(zmq.DEALER), context.socket(zmq.DEALER)
         for socket in (client, stopper):
-            socket.setsockopt(zmq.LINGER, 0)
             socket.connect(addresses[1])
         long = msgpack.packb({"command": "move", "x": [[[1]] * 60] * 20})
         for _ in range(bounds.UNANSWERED_MAX):
@@ -426,13 +419,13 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(con
         until(lambda: [served.settle(1), len(asked) == bounds.UNANSWERED_MAX][1])
         stopper.send(msgpack.packb({"command": "stop"}))
         until(lambda: [served.settle(1), len(asked) == bounds.UNANSWERED_MAX + 1][1])
-        served.server.serve(note)
-        assert heard == ["stop"]
+        served.server.serve(heard)
+        assert heard.commands() == ["stop"]
         assert len(asked) == bounds.UNANSWERED_MAX - -(-4096 // len(long))
         replies: list[str] = []
 
         def answered() -> bool:
-            served.serve(note)
+            served.serve(heard)
             while client.poll(0):
                 replies.append(msgpack.unpackb(client.recv())["reason"])
             return len(replies) == bounds.UNANSWERED_MAX
@@ -450,7 +443,6 @@ class Flood:
     def __init__(self, context: zmq.Context[Any], address: str, clients: int, each: int) -> None:
         self.sockets = [context.socket(zmq.DEALER) for _ in range(clients)]
         for socket in self.sockets:
-            socket.setsockopt(zmq.LINGER, 0)
             socket.connect(address)
             for _ in range(each):
                 socket.send(msgpack.packb({"command": "move"}))
@@ -467,32 +459,26 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
     clock = VirtualClock()  # Time does not advance while clients connect.
     with Served(commands=addresses[1], clock=clock) as served:
         flood = Flood(context, addresses[1], clients=4, each=40)
-        order: list[str] = []
+        heard = Heard()
         link, queue = served.link, served.service.commands
-
-        def note(request: dict[str, Any], age: float) -> dict[str, Any]:
-            order.append(request["command"])
-            return {}
-
         until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
-        served.serve(note)  # Let the gateway process only part of the requests.
-        carried_out = len(order)
+        served.serve(heard)  # Let the gateway process only part of the requests.
+        carried_out = len(heard.requests)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)
-        stopper.setsockopt(zmq.LINGER, 0)
         stopper.connect(addresses[1])
         stopper.send_multipart([b"", msgpack.packb({"command": "stop"})])
         until(lambda: [served.settle(1), any(ask.urgent for ask in link.asked)][1])
 
         def serve() -> None:
-            clock.sleep_until(clock.now() + 1e-3)
-            served.serve(note)
+            pass_time(clock, 1e-3)
+            served.serve(heard)
 
         until(lambda: [serve(), stopper.poll(0)][1])
         # Each request before the stop receives a reply but is not executed.
         replies: list[dict[str, Any]] = []
         until(lambda: [serve(), flood.collect(replies) == 160][1])
-        assert order[carried_out:] == ["stop"]
+        assert heard.commands()[carried_out:] == ["stop"]
         assert sum(reply["ok"] for reply in replies) == carried_out
 
 
@@ -517,7 +503,7 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
         }
         assert all(reply["ok"] for reply in kind)
         # The rate limit allows another request after a second.
-        clock.sleep_until(clock.now() + 1.0)
+        pass_time(clock, 1.0)
         flood.sockets[0].send(msgpack.packb({"command": "move"}))
         last: list[dict[str, Any]] = []
         # The reply to the last request follows all replies to the flood.
@@ -526,21 +512,14 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
 
 
 def test_flooding_clients_leave_room_for_others(context, addresses):
-    heard = []
-
-    def note(request: dict[str, Any], age: float) -> dict[str, Any]:
-        heard.append(request["command"])
-        return {}
-
+    heard = Heard()
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
         # Let the requests fill the gateway's buffers.
         until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
-        other = Asking(context, served, addresses[1], "grasp").socket
-        until(lambda: [served.serve(note), other.poll(0)][1])
-        assert msgpack.unpackb(other.recv())["ok"]
+        assert Asking(context, served, addresses[1], "grasp").told(heard)["ok"]
         assert flood.sockets
-        assert len(heard) < 1100, "the request waited for later requests"
+        assert len(heard.requests) < 1100, "the request waited for later requests"
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o660])
@@ -577,17 +556,17 @@ def test_a_signal_while_sockets_are_created_ends_the_start_up(monkeypatch, addre
         os.kill(made[0].process.pid, 0)
 
 
-def heard(mode: Mode) -> set[str]:
+def accepted(mode: Mode) -> set[str]:
     return {name for name, each in COMMANDS.items() if mode in each.modes}
 
 
 def test_stop_and_status_are_accepted_in_every_mode():
-    assert all({"stop", "status"} <= heard(mode) for mode in Mode)
+    assert all({"stop", "status"} <= accepted(mode) for mode in Mode)
 
 
 def test_no_command_moves_a_hand_that_is_disarmed_or_has_a_fault():
-    assert heard(Mode.DISARMED) == {"arm", "demo", "disarm", "tare", "stop", "status"}
-    assert heard(Mode.FAULT) == {"clear", "stop", "status"}
+    assert accepted(Mode.DISARMED) == {"arm", "demo", "disarm", "tare", "stop", "status"}
+    assert accepted(Mode.FAULT) == {"clear", "stop", "status"}
 
 
 def test_a_valid_request_is_parsed():

@@ -31,7 +31,6 @@ def served(addresses: tuple[str, str], clock: VirtualClock) -> Iterator[Served]:
 
 def connect(context: Context, kind: int, address: str) -> zmq.Socket[bytes]:
     socket = context.socket(kind)
-    socket.setsockopt(zmq.LINGER, 0)
     socket.connect(address)
     return socket
 

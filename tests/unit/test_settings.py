@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.daemon.backends import BUILT_IN, known
+from softfinger.daemon.backends import BUILT_IN, Backend, known
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile import reference
 from softfinger.daemon.profile.factory import make_material, make_table
+from softfinger.daemon.profile.fields import Section, setting
 from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.validation import _set_depths, plausibility_warnings
@@ -335,12 +336,32 @@ def test_command_line_changes_override_the_file_and_are_checked_with_it(tmp_path
         "--set: tip.radios: unknown key; nearest: radius",
         '--set: loop.rate: found "fast", expected a valid number',
     ]
+    real = ["servos.backend=dynamixel", "tactile.backend=flexitac"]
+    with pytest.raises(SettingsError, match=r"^--set: tactile\.port \(right\): found \"/dev/a\""):
+        load(changes=[*real, 'tactile.port=["/dev/a", "/dev/a"]'])
 
 
-@pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1"])
+@pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1", "loop.rate.x=1"])
 def test_a_change_without_a_key_is_reported(change):
     with pytest.raises(SettingsError, match=r"^--set: found .* expected section\.key=value"):
-        load(changes=[change])
+        load(Path("sim"), changes=[change])
+
+
+@pytest.mark.parametrize("text", ["sub.gian=1", "subs=[{gian=1}]", "named={a={gian=1}}"])
+def test_an_unknown_key_in_a_nested_table_of_a_plugin_is_reported(monkeypatch, text):
+    class Sub(Section):
+        gain: float = 1.0
+
+    class Own(Section):
+        sub: Sub | None = None
+        subs: tuple[Sub, ...] = ()
+        named: dict[str, Sub] = setting({}, "", "")
+
+    own = Backend(lambda: None, name="own", source="plugin own", section=Own)
+    monkeypatch.setitem(BUILT_IN["tactile"], "own", own)
+    changes = ["servos.backend=none", "tactile.backend=own", f"plugins.own.{text}"]
+    with pytest.raises(SettingsError, match=r"plugins\.own\.[a-z0.]*\.gian: unknown key"):
+        load(changes=changes)
 
 
 def test_addresses_outside_this_machine_require_keys(tmp_path):

@@ -29,7 +29,7 @@ from softfinger.daemon.diagnosis.ports import (
 from softfinger.daemon.diagnosis.register_file import restore_registers, save_registers
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.profile.validation import device_ports, plausibility_warnings
+from softfinger.daemon.profile.validation import plausibility_warnings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import check_latency_timer
 from softfinger.daemon.types import FINGERS
@@ -87,7 +87,7 @@ def results(
     settings: Settings, fix: bool, save: Path | None = None, restore: Path | None = None
 ) -> Iterator[Finding]:
     """Perform the requested repairs, then run all checks in the order of their dependencies."""
-    ports = device_ports(settings)
+    ports = settings.ports(plugins=False)
     for kind in BUILT_IN:
         yield from (Finding("note", f"softfinger.{kind}", source(each)) for each in plugins(kind))
     yield note_ports()
