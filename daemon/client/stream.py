@@ -88,13 +88,15 @@ class Gaps:
     A message is identified by its ``number``. A message without ``number`` is identified by ``seq``
     divided by ``seq_step``. If the number decreases, no loss is counted, because either the daemon
     has restarted or a second daemon is running. If a copy marked ``again`` replaces a lost message,
-    the count decreases by 1.
+    the count decreases by 1. A copy with the number of a received message is a repetition if both
+    have the same time. Otherwise, the copy comes from a restarted daemon.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self._last: dict[str, int] = {}
-        self._received: deque[int] = deque(maxlen=_STORED_MESSAGE_COUNT)
+        # Numbers and times of the last messages.
+        self._received: deque[tuple[int, object]] = deque(maxlen=_STORED_MESSAGE_COUNT)
 
     def take(self, message: dict[str, Any]) -> bool:
         """Count one message; return False if the message is a repetition."""
@@ -104,22 +106,24 @@ class Gaps:
             if not isinstance(seq, int) or not isinstance(step, int) or step < 1:
                 return True
             place = seq // step
-        source, again = message.get("finger"), message.get("again")
-        key = source if isinstance(source, str) else ""
-        last = self._last.get(key)
-        if again is True and last is not None and place <= last:
-            if place in self._received:
+        finger, again = str(message.get("finger")), message.get("again")
+        last = self._last.get(finger, place - 1)
+        is_older = place <= last
+        received = place, message.get("mono_ns")
+        if again is True and is_older:
+            if received in self._received:
                 return False
-            self._received.append(place)
-            self.lost = max(self.lost - 1, 0)
-            return True
+            if all(place != number for number, _ in self._received):
+                self._received.append(received)
+                self.lost = max(self.lost - 1, 0)
+                return True
         if again is not None:
-            if last is not None and place <= last:
-                self._received.clear()  # The stored numbers belong to another daemon.
-            self._received.append(place)
-        if last is not None and place > last:
+            if is_older:
+                self._received.clear()  # The stored messages come from another daemon.
+            self._received.append(received)
+        if not is_older:
             self.lost += place - last - 1
-        self._last[key] = place
+        self._last[finger] = place
         return True
 
 

@@ -277,6 +277,16 @@ def test_gaps_are_counted_with_the_step_of_the_topic():
     assert not again.take({"seq": 5, "again": True})
 
 
+def test_the_first_messages_of_a_restarted_daemon_are_not_repetitions():
+    gaps = Gaps()
+    for t in (10, 20):  # time at which each daemon sends its first message
+        for seq in (1, 2):
+            message = {"seq": seq, "again": True, "mono_ns": t + seq}
+            assert gaps.take(message)
+            assert not gaps.take(message)
+    assert gaps.lost == 0
+
+
 def test_an_unknown_schema_is_reported_once_and_known_fields_are_kept(fake, hand):
     fake.changes = {"schema": 7, "news": [1, 2], "overruns": "many"}
     until(lambda: fake.published > 2)
