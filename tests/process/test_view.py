@@ -543,6 +543,8 @@ def test_invalid_messages_are_tolerated() -> None:
     kept.pictures.take(schema.STATE, {**state(0.0, 5), **GOALS})
     kept.pictures.draw()
     assert kept.newest["mode"] == "holding"
+    facts = kept.newest["facts"]
+    assert facts[facts.index("Messages unreadable") + 1] == str(kept.pictures.unreadable)
 
 
 def test_states_are_queued_while_a_picture_is_drawn(context, addresses):

@@ -170,7 +170,8 @@ def test_servo_temperature_is_shown():
 
 
 def told(seq: int, when: float, text: str, again: bool = False) -> dict[str, Any]:
-    return fake_daemon.event(seq, "mode", text) | {"timestamp": when, "again": again}
+    times = {"timestamp": when, "mono_ns": int(1e9 * when)}
+    return fake_daemon.event(seq, "mode", text) | times | {"again": again}
 
 
 TEXTS = ["first", "second", "third"]

@@ -21,7 +21,6 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.control.modes import COMMANDS, GRIPPING_MODES, Mode
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
@@ -30,7 +29,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.record_text import why_invalid
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.stream_state import StreamState, number, printable, text
+from softfinger.tools.terminal.stream_state import INVALID, StreamState, number, printable, text
 from softfinger.tools.terminal.text_layout import format_value
 from softfinger.tools.viewing import hand_drawing
 from softfinger.tools.viewing.hand_drawing import GOAL, OBJECT, FloatArray, touches
@@ -165,7 +164,6 @@ class Pictures:
         self.states = 0  # number of states since the last `clear`
         self.time = math.nan  # Unix time of the newest state [s]
         self._truth: dict[str, Any] | None = None
-        self._gaps = {topic: Gaps() for topic in TOPICS}
         self._begin_rows()
 
     def _begin_rows(self) -> None:
@@ -179,10 +177,10 @@ class Pictures:
     def take(self, topic: bytes, message: Any) -> None:
         """Process one untrusted message."""
         stamp = number(message, "timestamp")
-        if topic not in self._gaps or not 0.0 <= stamp < 2.0**32:
+        if topic not in TOPICS or not 0.0 <= stamp < 2.0**32:
             self.unreadable += 1
             return
-        if not self._gaps[topic].take(message):
+        if not self.feed.gaps[topic].take(message):
             return
         if topic == schema.STATE:
             if number(message, "seq") < self.feed.state.seq:
@@ -202,7 +200,10 @@ class Pictures:
             if unknown:
                 self._say(f"unknown settings: {printable(', '.join(unknown))}")
             self._read_settings(settings)
-        self.feed.process(topic, message, self._moment())
+        try:
+            self.feed.process(topic, message, self._moment())
+        except INVALID:
+            self.unreadable += 1
         if self._foxglove is not None:
             self._foxglove.take(topic, message)
 
@@ -406,8 +407,8 @@ class Pictures:
         facts = [
             ("Age of the pressure maps", f"{each('frame_age_s', 1e3, 0)} ms"),
             ("Servos", f"{each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V"),
-            ("Messages lost", f"{sum(gaps.lost for gaps in self._gaps.values())}"),
-            ("Messages unreadable", f"{feed.skipped_count}"),
+            ("Messages lost", f"{sum(gaps.lost for gaps in feed.gaps.values())}"),
+            ("Messages unreadable", f"{self.unreadable}"),
             ("Loop overruns", f"{state.overruns}"),
         ]
         if times is not None:
