@@ -33,7 +33,7 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import RecordingWriter
 from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.viewing.page import listen
-from softfinger.tools.viewing.pictures import TOPICS, Pictures, Row
+from softfinger.tools.viewing.pictures import COLUMNS, TOPICS, Pictures, Row
 from softfinger.tools.viewing.saved import save
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
@@ -194,7 +194,6 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
                 picture["age"] >= picture["patience"]["state"]
             ):
                 pictures.append(picture)
-            scene = page.scene
             said = viewed.end()
     seqs = [each["seq"] for each in pictures]
     assert seqs == sorted(seqs)
@@ -216,7 +215,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         "compute_s": 11.0,
         "left.theta_std": 0.1,
     }
-    shown = {path: picture["row"][scene["columns"][path]] for path in expected}
+    shown = {path: picture["row"][COLUMNS[path]] for path in expected}
     assert shown == pytest.approx(expected, abs=1e-4)
     assert picture["row"][2] == picture["mode"] == "holding"
     assert picture["fault"] == ""
@@ -443,7 +442,7 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
                 rows = [row for row in kept.rows if row[0] >= picture["first"]]
                 assert len(rows) == pytest.approx(10 * place, abs=2)
                 for row in rows:
-                    force, was = row[kept.scene["columns"]["left.force"]], past[row[1]]
+                    force, was = row[COLUMNS["left.force"]], past[row[1]]
                     assert force == (pytest.approx(was, abs=1e-4) if math.isfinite(was) else None)
             assert playback.position == 1.5
             playback.ask("play")

@@ -61,15 +61,16 @@ class _Plot(NamedTuple):
     factor: float
     span: float
     paths: str  # `hand/state` fields
-    detail: bool = False  # True if the value is shown only on demand
+    detail: bool = False  # True if the plot is shown only on demand
+    headline: int | None = None  # decimals of the numbers above the plots, or None for no numbers
 
 
 _PLOTS = (
-    _Plot("Force", "N", 1.0, 2.0, "left.force right.force goal_force"),
-    _Plot("Object angle", "°", _DEGREE, 4.0, "object.angle goal_angle"),
-    _Plot("Displacement d", "mm", 1e3, 0.5, "left.d right.d"),
+    _Plot("Force", "N", 1.0, 2.0, "left.force right.force goal_force", headline=1),
+    _Plot("Object angle", "°", _DEGREE, 4.0, "object.angle goal_angle", headline=1),
+    _Plot("Object width", "mm", 1e3, 1.0, "object.width", True, headline=1),
+    _Plot("Displacement d", "mm", 1e3, 0.5, "left.d right.d", headline=2),
     _Plot("Tilt θ", "°", _DEGREE, 4.0, "left.theta right.theta"),
-    _Plot("Object width", "mm", 1e3, 1.0, "object.width", True),
     _Plot("Elastic energy", "mJ", 1e3, 2.0, "left.energy right.energy", True),
     _Plot("Joint angles", "°", _DEGREE, 2.0, "left.q right.q left.goal_q right.goal_q", True),
     _Plot(
@@ -81,12 +82,6 @@ _PLOTS = (
         True,
     ),
     _Plot("Loop times", "µs", 1e6, 50.0, "compute_s wake_late_s", True),
-)
-_HEADLINE = (  # title, decimals and plotted fields
-    ("Force", 1, "left.force right.force goal_force"),
-    ("Object angle", 1, "object.angle goal_angle"),
-    ("Object width", 1, "object.width"),
-    ("Displacement d", 2, "left.d right.d"),
 )
 _SERVOS = ("q", "current")  # fields that are not available without servos
 _DEVIATED = ("force", "d", "theta")  # finger fields whose standard deviation ({}_std) is also drawn
@@ -104,7 +99,7 @@ _FACTORS |= {
     for path, factor in _FACTORS.items()
     if path.rpartition(".")[2] in _DEVIATED
 }
-_COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # columns 0 to 2: number, time, mode
+COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # columns 0 to 2: number, time, mode
 _values = attrgetter(*_FACTORS)
 
 
@@ -114,7 +109,7 @@ def _row(number: int, state: HandState) -> list[Any]:
     for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
         row.append(round(min(max(factor * value, -_NUMBER_MAX), _NUMBER_MAX), 4))
     if not state.object.valid:
-        row[_COLUMNS["object.angle"]] = row[_COLUMNS["object.width"]] = math.nan
+        row[COLUMNS["object.angle"]] = row[COLUMNS["object.width"]] = math.nan
     return row
 
 
@@ -241,12 +236,6 @@ class Pictures:
             "step": STEP,
             "panels": panels,
             "plots": [_described(plot, paths) for plot, paths in plots if paths],
-            "headline": [
-                (title, decimals, shown)
-                for title, decimals, paths in _HEADLINE
-                if (shown := [*filter(self._has, paths.split())])
-            ],
-            "columns": _COLUMNS,
             "palette": heatmap.colour_map(),
             "modes": [mode.value for mode in Mode],
             "commands": {name: list(each.modes) for name, each in COMMANDS.items()},
@@ -429,9 +418,9 @@ def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
         finger, _, key = path.rpartition(".")
         goal = key.startswith("goal")
         name, colour = _OTHERS.get(path, (f"{finger} goal".strip() if goal else finger, finger))
-        spread = _COLUMNS.get(f"{path}_std")
+        spread = COLUMNS.get(f"{path}_std")
         lines.append(
-            {"name": name, "colour": colour or GOAL, "column": _COLUMNS[path]}
+            {"name": name, "colour": colour or GOAL, "column": COLUMNS[path]}
             | {"spread": spread, "goal": goal}
         )
     return plot._asdict() | {"lines": lines}
