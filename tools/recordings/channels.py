@@ -42,6 +42,17 @@ _LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's log levels, where 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 
+def flat(message: dict[str, Any], outer: str = "") -> dict[str, Any]:
+    """Flatten nested maps; the entry ``force`` in the map ``left`` becomes ``left.force``."""
+    fields: dict[str, Any] = {}
+    for key, value in message.items():
+        if isinstance(value, dict):
+            fields |= flat(value, f"{outer}{key}.")
+        else:
+            fields[f"{outer}{key}"] = value
+    return fields
+
+
 def channel_name(topic: bytes, message: dict[str, Any]) -> str:
     """Return a message's channel name, formed from the topic and, for a frame, the finger."""
     if topic == schema.TACTILE:
