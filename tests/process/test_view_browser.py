@@ -377,6 +377,10 @@ def test_controls_follow_the_hand_and_the_last_value_is_always_sent(page, fake):
         page.focus("body")
         page("document.activeElement.blur()")
 
+        page.arrow("Left")  # The hand holds the object at 5°.
+        until(lambda: fake.requests[-1]["command"] == "rotate")
+        assert fake.requests[-1]["angle"] == pytest.approx(0.0, abs=1e-3)
+
         fake.replies["grasp"] = {"ok": False, "error": "grasp: too hot for that"}
         page.key("Equal", "+", text="+")
         until(lambda: page.text("#force output") == "✗ grasp: too hot for that")
@@ -538,10 +542,16 @@ def test_a_phone_opens_the_page_with_the_code_and_can_use_all_controls(page, fak
 # A recording
 
 
-def test_a_recording_is_played(page, tmp_path):
-    path = tmp_path / "a.mcap"
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record 2 s of the simulated hand, which grasps the object."""
+    path = tmp_path_factory.mktemp("recorded") / "a.mcap"
     record_hand(path, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
-    with Viewed(str(path)) as viewed:
+    return path
+
+
+def test_a_recording_is_played(page, recorded):
+    with Viewed(str(recorded)) as viewed:
         page.open(viewed.address)
         until(lambda: page.text("#clock") == "2.0 of 2.0 s")
         until(lambda: page.text("#playing") == "Play")
@@ -573,9 +583,8 @@ def test_a_recording_is_played(page, tmp_path):
         viewed.end()
 
 
-def test_a_saved_recording_is_played_from_its_file(page, tmp_path):
-    recorded, path = tmp_path / "a.mcap", tmp_path / "a.html"
-    record_hand(recorded, {30: {"command": "arm"}, 60: {"command": "grasp", "force": 8.0}}, 2.0)
+def test_a_saved_recording_is_played_from_its_file(page, recorded, tmp_path):
+    path = tmp_path / "a.html"
     assert softfinger("view", recorded, "--save", path).returncode == 0
     page.open(path.as_uri())
     until(lambda: page.text("#clock") == "2.0 of 2.0 s")

@@ -181,10 +181,8 @@ def test_repeated_events_are_shown_once_and_in_order():
     feed = StreamState()
     # The third event arrives as a new event before the events are repeated.
     give(feed, b"hand/event", told(3, 103.0, "third"))
-    for seq in (1, 2, 3):
-        give(
-            feed, b"hand/event", told(seq, 100.0 + seq, ("first", "second", "third")[seq - 1], True)
-        )
+    for seq, text in enumerate(TEXTS, 1):
+        give(feed, b"hand/event", told(seq, 100.0 + seq, text, True))
     assert [event.text for event in feed.events] == TEXTS
     assert [event.text for event in feed.news()] == ["third", "first", "second"]
     assert feed.news() == []

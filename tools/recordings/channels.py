@@ -93,7 +93,8 @@ def from_json(topic: bytes) -> Converter:
     return partial(_restored, topic, floats, [field.name for field in fields])
 
 
-def _stamp(unix: object) -> dict[str, int]:
+def stamp(unix: object) -> dict[str, int]:
+    """Convert a Unix time [s] to Foxglove's form; an invalid time becomes 0."""
     if not isinstance(unix, float) or not 0.0 <= unix < 2.0**32:
         return {"sec": 0, "nsec": 0}
     seconds = math.floor(unix)
@@ -106,7 +107,7 @@ def _image(message: dict[str, Any]) -> dict[str, Any]:
     data = message.get("data")
     message["data"] = base64.b64encode(data).decode() if isinstance(data, bytes) else ""
     return {
-        "timestamp": _stamp(unix),
+        "timestamp": stamp(unix),
         "frame_id": message.get("finger"),
         "width": width,
         "height": height,
@@ -120,7 +121,7 @@ def _image(message: dict[str, Any]) -> dict[str, Any]:
 def _log(message: dict[str, Any]) -> dict[str, Any]:
     unix, severity = message.pop("timestamp", None), message.pop("level", None)
     return {
-        "timestamp": _stamp(unix),
+        "timestamp": stamp(unix),
         "level": _LEVELS.get(severity, 0) if isinstance(severity, str) else 0,
         "message": message.get("text"),
         "name": message.get("kind"),

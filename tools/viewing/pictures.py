@@ -233,7 +233,6 @@ class Pictures:
         self._scene = {
             "live": self._live,
             "period": self._period,
-            "step": STEP,
             "panels": panels,
             "plots": [_described(plot, paths) for plot, paths in plots if paths],
             "palette": heatmap.colour_map(),
@@ -416,12 +415,11 @@ def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
     lines = []
     for path in paths:
         finger, _, key = path.rpartition(".")
-        goal = key.startswith("goal")
-        name, colour = _OTHERS.get(path, (f"{finger} goal".strip() if goal else finger, finger))
+        role = f"{finger} goal".strip() if key.startswith("goal") else finger
+        name, colour = _OTHERS.get(path, (role, finger))
         spread = COLUMNS.get(f"{path}_std")
         lines.append(
-            {"name": name, "colour": colour or GOAL, "column": COLUMNS[path]}
-            | {"spread": spread, "goal": goal}
+            {"name": name, "colour": colour or GOAL, "column": COLUMNS[path], "spread": spread}
         )
     return plot._asdict() | {"lines": lines}
 
