@@ -96,7 +96,7 @@ class Gaps:
         self.lost = 0
         self._last: dict[str, int] = {}
         # Numbers and times of the last messages.
-        self._received: deque[tuple[int, object]] = deque(maxlen=_STORED_MESSAGE_COUNT)
+        self._received: deque[tuple[int, int]] = deque(maxlen=_STORED_MESSAGE_COUNT)
 
     def take(self, message: dict[str, Any]) -> bool:
         """Count one message; return False if the message is a repetition."""
@@ -109,7 +109,8 @@ class Gaps:
         finger, again = str(message.get("finger")), message.get("again")
         last = self._last.get(finger, place - 1)
         is_older = place <= last
-        received = place, message.get("mono_ns")
+        time_ns = message.get("mono_ns")
+        received = place, time_ns if isinstance(time_ns, int) else 0
         if again is True and is_older:
             if received in self._received:
                 return False

@@ -1,12 +1,24 @@
-"""Record the simulated hand while it executes commands at given ticks of the virtual clock."""
+"""Record given messages, or the simulated hand while it executes commands at given ticks."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from softfinger import Refused
 from softfinger.testing import VirtualHand
+from softfinger.tools.recordings.reader import Recording
+from softfinger.tools.recordings.record import RecordingWriter
 
 TICK = 0.002  # s
+
+
+def write_recording(path: Path, messages: Iterable[tuple[bytes, dict[str, Any]]] = ()) -> Recording:
+    """Write ``messages`` to a new recording and open it."""
+    writer = RecordingWriter(path)
+    for topic, message in messages:
+        writer.add(topic, dict(message))  # The writer may modify the map.
+    writer.close()
+    return Recording(path)
 
 
 def record_hand(

@@ -16,7 +16,8 @@ WAIT = 60.0  # timeout for one picture [s]
 class Viewed:
     """A ``softfinger view`` process; the constructor returns once the process is serving.
 
-    ``address`` is the page's address, and ``commanding`` is the same address with the token.
+    ``address`` is the page's address, ``commanding`` is the same address with the token, and
+    ``query`` is the part with the token.
     ``folder`` is the working directory, where recordings are also stored.
     """
 
@@ -35,6 +36,7 @@ class Viewed:
             if line.rstrip().endswith(("to view the hand", "in one browser")):
                 break
         self.host = urlsplit(self.address).netloc
+        self.query = self.commanding.removeprefix(self.address)
 
     def end(self) -> str:
         """Stop the process with a signal and return its output."""
@@ -50,6 +52,21 @@ class Viewed:
         if self.process.returncode is None:
             self.process.kill()
             self.process.communicate()
+
+
+def upgrade_request(host: str, path: str) -> bytes:
+    """Return the HTTP request that opens a WebSocket connection."""
+    return (
+        f"GET {path} HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+    ).encode()
+
+
+def masked(text: str) -> bytes:
+    """Return a client's WebSocket text frame with a zero mask."""
+    data = text.encode()
+    assert len(data) < 126
+    return bytes([0x81, 0x80 | len(data), 0, 0, 0, 0]) + data
 
 
 class Watcher:

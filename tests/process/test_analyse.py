@@ -1,6 +1,5 @@
 """Test that ``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,9 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame, HandInfo, SensorInfo
 from softfinger.daemon.wire import schema
 from softfinger.tools.analysis.analyse import analyse, open_source, write_csv
-from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.golden_wire import message_maker
+from tests.harness.recorded_hand import write_recording
+from tests.process.test_export import rows_of
 
 TIP, PITCH, SCALE = Fingertip(0.020), 0.058 / 44, 4.0
 DEPTHS = np.linspace(0.0, 0.005, 26)
@@ -28,11 +28,6 @@ def counts() -> np.ndarray:
     return np.round(np.stack([np.zeros((44, 44)), *frames]) / SCALE).astype(np.uint16)
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def check(path: Path) -> None:
     rows = rows_of(path)
     assert len(rows) == len(DEPTHS)
@@ -46,15 +41,14 @@ def check(path: Path) -> None:
 
 
 def save_stream(path: Path, counts: np.ndarray, settings: Settings) -> None:
-    writer = RecordingWriter(path)
     facts = HandInfo("0.1.0", settings.model_dump_json(), "", "", "", "")
-    writer.add(schema.SETTINGS, message_maker(schema.SETTINGS)(1, 1e9, 1.0, facts))
+    messages = [(schema.SETTINGS, message_maker(schema.SETTINGS)(1, 1e9, 1.0, facts))]
     sensor = SensorInfo(PITCH, PITCH, 0.0, 0.0, 0.0, "count", SCALE, False, "")
     for k, data in enumerate(counts):
         frame = Frame(k + 1, 0.01 * k, 0.01 * k, True, data)
         message = message_maker(schema.TACTILE)(frame, data, 0, sensor, 1e9 + 0.01 * k)
-        writer.add(schema.TACTILE, message)
-    writer.close()
+        messages.append((schema.TACTILE, message))
+    write_recording(path, messages)
 
 
 def test_unusable_frames_are_counted_by_reason(counts, tmp_path):

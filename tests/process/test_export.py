@@ -11,12 +11,17 @@ from softfinger import read_recording
 from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.export import CsvTable, ParquetTable, export
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.fake_daemon import frame
 from tests.harness.golden_wire import flat, sample
+from tests.harness.recorded_hand import write_recording
 from tests.process.test_record import written
 
 STATES = 2050
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +33,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_csv_has_every_field_in_full_precision(path, tmp_path):
     export(Recording(path), tmp_path, CsvTable, [schema.STATE])
-    with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "hand-state.csv")
     assert len(rows) == STATES
     expected = flat(sample(schema.STATE))
     assert list(rows[0]) == ["t", *expected]
@@ -69,25 +73,21 @@ def test_parquet_keeps_types_and_frames(path, tmp_path):
 
 @pytest.mark.parametrize("first", [schema.STATE, schema.TACTILE])
 def test_times_of_all_files_count_from_one_zero(tmp_path, first):
-    writer = RecordingWriter(tmp_path / "a.mcap")
     before = {"mono_ns": 6_000_000_000, "timestamp": 1e9 + 6.0, "again": True}
-    writer.add(schema.EVENT, sample(schema.EVENT) | before)
     scan = {"mono_ns": 7_000_000_000, "timestamp": 1e9 + 7.02, "delay_s": 0.02}
     tick = {"mono_ns": 7_020_000_000, "timestamp": 1e9 + 7.02}
     messages = [(schema.STATE, sample(schema.STATE) | tick)]
     messages.insert(first != schema.TACTILE, (schema.TACTILE, frame(0.0, 1) | scan))
-    for topic, message in messages:
-        writer.add(topic, message)
+    messages.insert(0, (schema.EVENT, sample(schema.EVENT) | before))
     # The system's Unix time was changed between the two messages.
     late = {"mono_ns": 9_020_000_000, "timestamp": 1e9 + 9.52}
-    writer.add(schema.STATE, sample(schema.STATE) | late)
-    writer.close()
-    recording = Recording(tmp_path / "a.mcap")
+    messages.append((schema.STATE, sample(schema.STATE) | late))
+    recording = write_recording(tmp_path / "a.mcap", messages)
     export(recording, tmp_path, CsvTable, recording.topics)
-    times = {}
-    for topic in ("state", "tactile", "event"):
-        with (tmp_path / f"hand-{topic}.csv").open(encoding="utf-8") as file:
-            times[topic] = [float(row["t"]) for row in csv.DictReader(file)]
+    times = {
+        topic: [float(row["t"]) for row in rows_of(tmp_path / f"hand-{topic}.csv")]
+        for topic in ("state", "tactile", "event")
+    }
     assert times["state"] == pytest.approx([0.0, 2.0], abs=1e-6)
     assert times["tactile"] == pytest.approx([-0.02], abs=1e-6)
     assert times["event"] == pytest.approx([-1.02], abs=1e-6)
@@ -97,25 +97,20 @@ def test_times_of_all_files_count_from_one_zero(tmp_path, first):
 
 
 def test_nan_values_are_empty_cells(tmp_path):
-    writer = RecordingWriter(tmp_path / "a.mcap")
     message = sample(schema.STATE)
     message["left"]["force"] = math.nan
     message["news"] = 3.5  # Only newer daemons send the field.
-    writer.add(schema.STATE, message)
-    writer.close()
-    export(Recording(tmp_path / "a.mcap"), tmp_path, CsvTable, [schema.STATE])
-    with (tmp_path / "hand-state.csv").open(newline="", encoding="utf-8") as file:
-        [row] = csv.DictReader(file)
+    recording = write_recording(tmp_path / "a.mcap", [(schema.STATE, message)])
+    export(recording, tmp_path, CsvTable, [schema.STATE])
+    [row] = rows_of(tmp_path / "hand-state.csv")
     assert (row["left.force"], row["news"]) == ("", "3.5")
     assert next(iter(row)) == "t"
 
 
 def test_files_have_plain_names_for_any_topic_prefix(tmp_path):
-    writer = RecordingWriter(tmp_path / "a.mcap")
-    for topic in (b".hidden", b"\x1b[2Jhand/../../x", b"nul\0", b"/"):
-        writer.add(topic, {"timestamp": 1e9, "a": 1})
-    writer.close()
-    recording = Recording(tmp_path / "a.mcap")
+    topics = (b".hidden", b"\x1b[2Jhand/../../x", b"nul\0", b"/")
+    messages = [(topic, {"timestamp": 1e9, "a": 1}) for topic in topics]
+    recording = write_recording(tmp_path / "a.mcap", messages)
     files = export(recording, tmp_path, CsvTable, recording.topics)
     names = {file.name for file in files}
     assert names == {"hidden.csv", "-[2Jhand-..-..-x.csv".replace("[", "-"), "nul-.csv", "-.csv"}
@@ -128,8 +123,7 @@ def test_command_line_output(path, tmp_path, inline):
     done = inline("export", path, *words)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.strip() == str(out / "hand-state.csv")
-    with (out / "hand-state.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(out / "hand-state.csv")
     assert 100 <= len(rows) <= 101
     assert float(rows[0]["t"]) == pytest.approx(100.0, abs=1.01)
     done = inline("export", path, "--topics", "dreams")
@@ -142,7 +136,7 @@ def test_command_line_output(path, tmp_path, inline):
 
 def test_invalid_exports_are_refused(tmp_path, inline):
     empty = tmp_path / "empty.mcap"
-    RecordingWriter(empty).close()
+    write_recording(empty)
     done = inline("export", empty)
     assert done.returncode == 1
     assert "the recording does not contain any messages" in done.stderr

@@ -26,6 +26,7 @@ from softfinger.tools.viewing.hand_drawing import hand_parts
 from tests.conftest import until
 from tests.harness.daemon_process import started
 from tests.harness.fake_daemon import FakeDaemon, event, frame, state
+from tests.harness.viewed import WAIT, masked, upgrade_request
 from tests.process.test_untrusted_clients import place
 
 TOPICS = {
@@ -37,7 +38,6 @@ TOPICS = {
     "hand/tactile/left": "foxglove.RawImage",
     "hand/tactile/right": "foxglove.RawImage",
 }
-WAIT = 60.0  # timeout for one message [s]
 
 
 class Client:
@@ -221,11 +221,9 @@ def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
     with ExitStack() as stack:
         lazy = []
         for _ in range(CLIENT_COUNT_MAX):
-            client = stack.enter_context(
-                socket.create_connection(place(address.removeprefix("ws://")), timeout=WAIT)
-            )
-            host = address.removeprefix("ws://").encode()
-            client.sendall(REQUEST.replace(b"HOST", host))
+            host = address.removeprefix("ws://")
+            client = stack.enter_context(socket.create_connection(place(host), timeout=WAIT))
+            client.sendall(upgrade_request(host, "/"))
             answer = b""
             while b'"advertise"' not in answer:
                 answer += client.recv(65536)
@@ -234,7 +232,8 @@ def test_a_client_that_does_not_read_is_dropped_for_another(stranger):
             late.recv(timeout=WAIT)
         for client in lazy:
             for channel in range(len(TOPICS)):
-                client.sendall(masked({"subscriptions": [{"id": 1, "channelId": channel}]}))
+                wanted = {"subscriptions": [{"id": 1, "channelId": channel}]}
+                client.sendall(masked(json.dumps(wanted)))
         until(lambda: connections(address) < CLIENT_COUNT_MAX)
         with connected(address) as line:
             Client(line)  # The server must accept a new client.
@@ -251,19 +250,6 @@ def test_incomplete_and_invalid_requests_are_closed(stranger):
             line.send(f'{{"subscriptions": [{{{odd}}}]}}' if odd[0] == '"' else odd)
             with pytest.raises(ConnectionClosed):
                 line.recv(timeout=WAIT)
-
-
-REQUEST = (
-    b"GET / HTTP/1.1\r\nHost: HOST\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
-)
-
-
-def masked(message: dict[str, Any]) -> bytes:
-    """Return a client's WebSocket text frame with a zero mask."""
-    text = json.dumps(message).encode()
-    assert len(text) < 126
-    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
 
 
 def test_foxglove_requires_the_live_stream(capsys):

@@ -1,7 +1,6 @@
 """Test the pages that ``softfinger plot`` makes of complete and incomplete recordings."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,13 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 
+from softfinger.daemon.wire import schema
 from softfinger.tools import style
 from softfinger.tools.analysis import plot
-from softfinger.tools.analysis.plot import Missing, RecordedRun, load_run
+from softfinger.tools.analysis.plot import Missing, RecordedRun
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.record import RecordingWriter
-from tests.conftest import Inline
-from tests.harness.recorded_hand import record_hand
+from tests.harness.recorded_hand import record_hand, write_recording
 
 DUE = {
     50: {"command": "arm"},
@@ -36,9 +34,14 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def loaded(path: Path) -> RecordedRun:
+    recording = Recording(path)
+    return RecordedRun(recording, recording.states())
+
+
 @pytest.fixture(scope="module")
 def run(path: Path) -> RecordedRun:
-    return load_run(Recording(path), -math.inf, math.inf)
+    return loaded(path)
 
 
 def drawn(run: RecordedRun, page: str) -> Figure:
@@ -57,20 +60,6 @@ def lines(figure: Figure, label: str) -> list[np.ndarray]:
         for line in axes.lines
         if line.get_label() == label and len(line.get_xdata()) > 0
     ]
-
-
-Call = Callable[..., tuple[int, str]]
-
-
-@pytest.fixture
-def call(inline: Inline) -> Call:
-    """Run ``softfinger plot`` in the test process; return exit status and standard error."""
-
-    def plotted(*words: object) -> tuple[int, str]:
-        status, _, said = inline("plot", *words)
-        return status, said
-
-    return plotted
 
 
 @pytest.mark.extended
@@ -132,25 +121,27 @@ def test_landscape_shows_the_local_minimum_and_the_path(run):
 
 
 @pytest.mark.extended
-def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, call):
+def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, inline):
     words = ("--format", "svg", "--from", 1, "--to", 2)
-    assert call(path, *words, "--out", tmp_path / "a" / "b") == (0, "")
+    done = inline("plot", path, *words, "--out", tmp_path / "a" / "b")
+    assert (done.returncode, done.stderr) == (0, "")
     files = sorted((tmp_path / "a" / "b").iterdir())
     assert [each.name for each in files] == ["angle.svg", "landscape.svg", "time.svg"]
     assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
-    status, said = call(path, "--to", "0.2", "--out", tmp_path / "none")
-    assert status == 1
-    assert "plot: the recording does not contain a contact" in said
-    RecordingWriter(tmp_path / "nothing.mcap").close()
-    status, said = call(tmp_path / "nothing.mcap", "--out", tmp_path / "none")
-    assert status == 1
-    assert "plot: the recording does not contain hand/state" in said
+    done = inline("plot", path, "--to", "0.2", "--out", tmp_path / "none")
+    assert done.returncode == 1
+    assert "plot: the recording does not contain a contact" in done.stderr
+    write_recording(tmp_path / "nothing.mcap")
+    done = inline("plot", tmp_path / "nothing.mcap", "--out", tmp_path / "none")
+    assert done.returncode == 1
+    assert "plot: the recording does not contain hand/state" in done.stderr
 
 
-def test_without_settings_no_model_is_drawn(path, run):
-    bare = replace(run, models=None, why_no_model="no reason")
+def test_without_settings_no_model_is_drawn(path, tmp_path):
+    write_recording(tmp_path / "bare.mcap", Recording(path).messages([schema.STATE]))
+    bare = loaded(tmp_path / "bare.mcap")
     for page in ("angle", "landscape"):
-        with pytest.raises(Missing, match="no reason"):
+        with pytest.raises(Missing, match=r"^the recording does not contain hand/settings"):
             plot.PAGES[page](bare)
 
 
@@ -160,7 +151,7 @@ def test_a_recording_of_one_finger_is_drawn(tmp_path):
     due = {50: {"command": "arm"}, 60: {"command": "grasp", "force": 2.0}}
     one = ('scene.fingers=["left"]', "scene.object_model=false")
     record_hand(path, due, 2.5, one)
-    run = load_run(Recording(path), -math.inf, math.inf)
+    run = loaded(path)
     assert run.fingers == ("left",)
     for page in plot.PAGES:
         figure = drawn(run, page)
@@ -168,10 +159,10 @@ def test_a_recording_of_one_finger_is_drawn(tmp_path):
 
 
 @pytest.mark.extended
-def test_a_truncated_recording_is_drawn(tmp_path, path, call):
+def test_a_truncated_recording_is_drawn(tmp_path, path, inline):
     whole = path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
-    status, said = call(tmp_path / "cut.mcap", "--out", tmp_path / "cut")
-    assert status == 0
-    assert "cut short" in said
+    done = inline("plot", tmp_path / "cut.mcap", "--out", tmp_path / "cut")
+    assert done.returncode == 0
+    assert "cut short" in done.stderr
     assert (tmp_path / "cut" / "angle.png").exists()

@@ -28,6 +28,7 @@ from tests.conftest import until
 from tests.harness.daemon_process import ask, started
 from tests.harness.fake_daemon import frame
 from tests.harness.golden_wire import sample
+from tests.harness.recorded_hand import write_recording
 
 TOPICS = tuple(schema.TOPICS)
 EVENT = schema.EVENT
@@ -61,10 +62,7 @@ def written(path: Path, count: int = 400) -> list[tuple[bytes, dict[str, Any]]]:
         sent.append((schema.STATE, {**sample(schema.STATE), "seq": k, **times}))
         if k % 10 == 0:
             sent.append((schema.TACTILE, frame(k / 25, k % 20 // 10) | times))
-    writer = RecordingWriter(path)
-    for topic, message in sent:
-        writer.add(topic, dict(message))
-    writer.close()
+    write_recording(path, sent)
     return sent
 
 
@@ -92,9 +90,7 @@ def test_states_of_a_recording_are_columns(tmp_path):
     assert columns["mode"][0] == states[0]["mode"]
     assert columns["t"].tolist() == pytest.approx(range(400))
     assert {len(column) for column in columns.values()} == {400}
-    writer = RecordingWriter(tmp_path / "b.mcap")
-    writer.add(schema.TACTILE, {**frame(0.0, 0), "timestamp": 1e9})
-    writer.close()
+    write_recording(tmp_path / "b.mcap", [(schema.TACTILE, frame(0.0, 0) | {"timestamp": 1e9})])
     with pytest.raises(RecordingError, match=r"b\.mcap: the recording does not contain hand/state"):
         read_recording(str(tmp_path / "b.mcap"))
 
@@ -104,10 +100,7 @@ def test_every_topic_keeps_its_bytes_and_has_a_schema(tmp_path, topic):
     from mcap.reader import make_reader
 
     path = tmp_path / "a.mcap"
-    writer = RecordingWriter(path)
-    writer.add(topic, sample(topic))
-    writer.close()
-    [(told, message)] = Recording(path).messages()
+    [(told, message)] = write_recording(path, [(topic, sample(topic))]).messages()
     assert told == topic
     golden = msgpack.unpackb(pack(sample(topic)))
     assert message == golden
@@ -141,15 +134,13 @@ def test_the_layout_uses_only_published_fields():
 
 
 def test_non_finite_numbers_are_read_as_nan(tmp_path):
-    writer = RecordingWriter(tmp_path / "a.mcap")
     message = sample(schema.STATE)
     message["left"]["force"] = math.nan
     message["tick_s"] = math.inf
-    writer.add(schema.STATE, message)
-    writer.add(schema.STATE, {"seq": 2**70, "left": {1, 2}})
-    writer.close()
-    assert writer.messages == 1
-    [(_, read)] = Recording(tmp_path / "a.mcap").messages()
+    messages = [(schema.STATE, each) for each in (message, {"seq": 2**70, "left": {1, 2}})]
+    recording = write_recording(tmp_path / "a.mcap", messages)
+    assert recording.total == 1
+    [(_, read)] = recording.messages()
     assert math.isnan(read["left"]["force"])
     assert math.isnan(read["tick_s"])  # JSON cannot represent infinity.
 
@@ -345,23 +336,17 @@ def test_topics_are_selected_by_name(fake, tmp_path):
 
 def test_repeated_messages_do_not_extend_the_time_range(tmp_path):
     """If a recorder starts late, the daemon repeats the first events and the settings."""
-    path = tmp_path / "a.mcap"
-    writer = RecordingWriter(path)
     old = {"schema": 1, "seq": 1, "again": True, "timestamp": 1.7e9 - 7200.0, "mono_ns": 5}
-    writer.add(b"hand/settings", dict(old))
-    for k in range(3):
-        writer.add(b"hand/state", {"schema": 1, "seq": k, "timestamp": 1.7e9 + 0.25 * k})
-    writer.add(b"hand/event", {**old, "seq": 2})
-    writer.close()
-    recording = Recording(path)
+    repeated = [(b"hand/settings", old)]
+    states = [{"schema": 1, "seq": k, "timestamp": 1.7e9 + 0.25 * k} for k in range(3)]
+    messages = [*repeated, *((b"hand/state", state) for state in states)]
+    messages.append((b"hand/event", {**old, "seq": 2}))
+    recording = write_recording(tmp_path / "a.mcap", messages)
     assert (recording.start, recording.duration) == (pytest.approx(1.7e9), pytest.approx(0.5))
     kept = [message for topic, message in recording.messages() if b"state" not in topic]
     # The messages keep their original times.
     assert [each["timestamp"] for each in kept] == [1.7e9 - 7200.0] * 2
-    lonely = RecordingWriter(tmp_path / "b.mcap")
-    lonely.add(b"hand/settings", dict(old))
-    lonely.close()
-    assert Recording(tmp_path / "b.mcap").count(b"hand/settings") == 1
+    assert write_recording(tmp_path / "b.mcap", repeated).count(b"hand/settings") == 1
 
 
 @pytest.mark.extended

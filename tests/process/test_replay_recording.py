@@ -1,5 +1,6 @@
 """Test that replaying a recording publishes unchanged messages or recomputes identical states."""
 
+import copy
 import json
 import re
 from pathlib import Path
@@ -15,12 +16,11 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute
-from softfinger.tools.recordings.record import RecordingWriter
 from tests.conftest import until
 from tests.harness.daemon_process import PATIENT, softfinger, started
 from tests.harness.golden_recording import MADE_ON, RECORDING, machine_class
 from tests.harness.golden_wire import sample
-from tests.harness.recorded_hand import record_hand
+from tests.harness.recorded_hand import record_hand, write_recording
 
 Messages = list[tuple[bytes, dict[str, Any]]]
 
@@ -43,21 +43,8 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Messages:
     return sent
 
 
-def record(path: Path, taken: Messages) -> Recording:
-    writer = RecordingWriter(path)
-    for topic, message in taken:
-        writer.add(topic, _copy(message))
-    writer.close()
-    return Recording(path)
-
-
-def _copy(message: dict[str, Any]) -> dict[str, Any]:
-    copied: dict[str, Any] = msgpack.unpackb(pack(message))
-    return copied
-
-
 def test_equal_inputs_give_bitwise_equal_states(taken, tmp_path):
-    result = recompute(record(tmp_path / "a.mcap", taken))
+    result = recompute(write_recording(tmp_path / "a.mcap", taken))
     assert result.from_start
     assert result.ticks == result.states == 1150
     assert result.fields > 40
@@ -66,7 +53,7 @@ def test_equal_inputs_give_bitwise_equal_states(taken, tmp_path):
 
 
 def test_other_settings_report_the_first_difference(taken, tmp_path):
-    recording = record(tmp_path / "a.mcap", taken)
+    recording = write_recording(tmp_path / "a.mcap", taken)
     used = load(changes=["loop.clock=virtual", "stream.state_rate=500", "control.force_gain=0.5"])
     result = recompute(recording, used)
     assert "left.goal_current" in result.differences
@@ -78,11 +65,11 @@ def test_other_settings_report_the_first_difference(taken, tmp_path):
 
 
 def test_a_changed_reading_is_detected(taken, tmp_path):
-    bent = [(topic, _copy(message)) for topic, message in taken]
+    bent = copy.deepcopy(taken)
     for topic, message in bent:
         if topic == schema.INPUT and message["seq"] == 400:
             message["left"]["q"] += 1e-9
-    result = recompute(record(tmp_path / "a.mcap", bent))
+    result = recompute(write_recording(tmp_path / "a.mcap", bent))
     assert result.differences["left.q"].count == 1
     assert result.differences["left.q"].first_tick == 400
     assert min(each.first_tick for each in result.differences.values()) == 400
@@ -91,7 +78,7 @@ def test_a_changed_reading_is_detected(taken, tmp_path):
 def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
     def without(topic: bytes) -> Recording:
         path = tmp_path / f"{topic.decode().replace('/', '-')}.mcap"
-        return record(path, [each for each in taken if each[0] != topic])
+        return write_recording(path, [each for each in taken if each[0] != topic])
 
     with pytest.raises(RecordingError, match="does not contain hand/settings"):
         recompute(without(schema.SETTINGS))
@@ -100,19 +87,19 @@ def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
     blind = recompute(without(schema.TACTILE))
     assert blind.missing_frames > 100
     assert blind.differences
-    late = recompute(record(tmp_path / "late.mcap", taken[:1] + taken[2000:]))
+    late = recompute(write_recording(tmp_path / "late.mcap", taken[:1] + taken[2000:]))
     assert not late.from_start
     some = [each for k, each in enumerate(taken) if each[0] != schema.INPUT or k % 7]
-    assert recompute(record(tmp_path / "some.mcap", some)).missing_ticks > 10
+    assert recompute(write_recording(tmp_path / "some.mcap", some)).missing_ticks > 10
     thinned = [(topic, {**message}) for topic, message in taken]
     for topic, message in thinned:
         if topic == schema.TACTILE:
             message["seq_step"] = 4
     with pytest.raises(RecordingError, match="found only 1 of 4 frames"):
-        recompute(record(tmp_path / "thinned.mcap", thinned))
+        recompute(write_recording(tmp_path / "thinned.mcap", thinned))
     other = load(changes=["tactile.rows=32", "tactile.cols=32"])
     with pytest.raises(RecordingError, match="44 × 44 cells, expected 32 × 32 as in the settings"):
-        recompute(record(tmp_path / "other.mcap", taken), other)
+        recompute(write_recording(tmp_path / "other.mcap", taken), other)
 
 
 def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_path, inline):
@@ -155,7 +142,7 @@ def played(tmp_path: Path) -> tuple[Path, Messages]:
         sent.append((schema.STATE, state))
     sent.append((schema.TACTILE, {**sample(schema.TACTILE), "timestamp": 1e9 + 0.5}))
     path = tmp_path / "a.mcap"
-    record(path, sent)
+    write_recording(path, sent)
     return path, sent
 
 

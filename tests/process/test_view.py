@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from email.message import Message
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -24,22 +25,21 @@ import psutil
 import pytest
 import zmq
 from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.recordings.reader import Recording
-from softfinger.tools.recordings.record import RecordingWriter
 from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.viewing.page import listen
-from softfinger.tools.viewing.pictures import TOPICS, Pictures, Row
+from softfinger.tools.viewing.pictures import COLUMNS, TOPICS, Pictures, Row
 from softfinger.tools.viewing.saved import save
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
 from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
-from tests.harness.recorded_hand import record_hand
-from tests.harness.viewed import WAIT, Viewed, Watcher
+from tests.harness.recorded_hand import record_hand, write_recording
+from tests.harness.viewed import WAIT, Viewed, Watcher, masked, upgrade_request
 
 GRASP = {
     30: {"command": "arm"},
@@ -80,27 +80,31 @@ def view(fake: FakeDaemon, *words: str) -> Viewed:
     return Viewed(*where, *words)
 
 
-def got(host: str, path: str, **headers: str) -> tuple[int, str]:
-    connection = http.client.HTTPConnection(host, timeout=60)
+def got(host: str, path: str, **headers: str) -> tuple[int, str, Message]:
+    """Request a path; return the status, the body and the headers of the response."""
+    connection = http.client.HTTPConnection(host, timeout=WAIT)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     body = answer.read().decode()
     connection.close()
-    return answer.status, body
+    return answer.status, body, answer.headers
 
 
 def location(host: str, path: str) -> str:
     """Request a path and return the address to which the server redirects."""
-    connection = http.client.HTTPConnection(host, timeout=60)
-    connection.request("GET", path)
-    answer = connection.getresponse()
-    assert answer.status == 303
-    return str(answer.headers["Location"])
+    status, _, headers = got(host, path)
+    assert status == 303
+    return str(headers["Location"])
+
+
+def command_line(host: str, query: str, **more: Any) -> ClientConnection:
+    """Open a connection for commands as a page does."""
+    return connect(f"ws://{host}/command{query}", proxy=None, open_timeout=WAIT, **more)
 
 
 def ask(host: str, query: str, asked: Any, **more: Any) -> str:
     """Send a command or any other text to the viewer as a page does; return the reply."""
-    with connect(f"ws://{host}/command{query}", proxy=None, open_timeout=WAIT, **more) as line:
+    with command_line(host, query, **more) as line:
         line.send(orjson.dumps(asked).decode())
         return str(line.recv(timeout=WAIT))
 
@@ -110,15 +114,11 @@ ANSWERS = [("/", {}, 200), ("/nothing", {}, 404), ("/", {"Host": "evil.example"}
 
 @pytest.mark.parametrize(("path", "headers", "status"), ANSWERS)
 def test_responses_are_not_cached_framed_or_revealed_to_other_sites(served, path, headers, status):
-    _, viewed = served
-    connection = http.client.HTTPConnection(viewed.host, timeout=WAIT)
-    connection.request("GET", path, headers=headers)
-    answer = connection.getresponse()
-    connection.close()
-    assert answer.status == status
-    assert answer.headers["Referrer-Policy"] == "no-referrer"
-    assert answer.headers["Cache-Control"] == "no-store"
-    assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+    found, _, sent = got(served[1].host, path, **headers)
+    assert found == status
+    assert sent["Referrer-Policy"] == "no-referrer"
+    assert sent["Cache-Control"] == "no-store"
+    assert "frame-ancestors 'none'" in sent["Content-Security-Policy"]
 
 
 ODD = ["[" * 30_000, '{"command": ' + "[" * 30_000, '{"command":"a","x":' + "9" * 40 + "}"]
@@ -128,9 +128,7 @@ ODD += ['{"command": "\\ud800"}', "{"]
 @pytest.mark.parametrize("odd", ODD)
 def test_an_invalid_command_gets_a_reply(served, odd):
     fake, viewed = served
-    query = viewed.commanding.partition("/?")[2]
-    address = f"ws://{viewed.host}/command?{query}"
-    with connect(address, proxy=None, open_timeout=WAIT) as line:
+    with command_line(viewed.host, viewed.query) as line:
         for _ in range(2):  # The connection stays open after a refusal.
             line.send(odd)
             assert str(line.recv(timeout=WAIT)).startswith(
@@ -140,15 +138,15 @@ def test_an_invalid_command_gets_a_reply(served, odd):
 
 
 def test_ctrl_c_ends_it_while_the_daemon_does_not_reply(addresses):
-    with Viewed("--address", ",".join(addresses), "--timeout", "100000") as viewed:
-        query = viewed.commanding.partition("/?")[2]
-        address = f"ws://{viewed.host}/command?{query}"
-        with connect(address, proxy=None, open_timeout=WAIT) as line:
-            line.send(orjson.dumps({"command": "arm", "seen": time.monotonic()}).decode())
-            # The viewer waits.
-            assert any("no reply to arm" in line for line in viewed.process.stderr)
-            viewed.process.send_signal(signal.SIGINT)
-            assert viewed.process.wait(WAIT) == 1  # exit status without any picture
+    with (
+        Viewed("--address", ",".join(addresses), "--timeout", "100000") as viewed,
+        command_line(viewed.host, viewed.query) as line,
+    ):
+        line.send(orjson.dumps({"command": "arm", "seen": time.monotonic()}).decode())
+        # The viewer waits.
+        assert any("no reply to arm" in line for line in viewed.process.stderr)
+        viewed.process.send_signal(signal.SIGINT)
+        assert viewed.process.wait(WAIT) == 1  # exit status without any picture
 
 
 def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
@@ -158,25 +156,18 @@ def test_ctrl_c_ends_it_while_a_page_does_not_read(served):
             page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             page.connect((host, int(port)))
             page.settimeout(WAIT)
-            page.sendall(WATCH.format(host=viewed.host).encode())
-            wish = bytes([0x81, 0x80, 0, 0, 0, 0])  # empty text frame
+            page.sendall(upgrade_request(viewed.host, "/pictures"))
             page.setblocking(False)
             begun = fake.published
 
             def is_stuck() -> bool:
                 with suppress(BlockingIOError):
-                    page.send(wish)
+                    page.send(masked(""))
                 return fake.published > begun + 500  # A page's queue stores 5 s of pictures.
 
             until(is_stuck)
             viewed.process.send_signal(signal.SIGINT)
             assert viewed.process.wait(WAIT) == 0
-
-
-WATCH = (
-    "GET /pictures HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
-)
 
 
 # Contents
@@ -194,7 +185,6 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
                 picture["age"] >= picture["patience"]["state"]
             ):
                 pictures.append(picture)
-            scene = page.scene
             said = viewed.end()
     seqs = [each["seq"] for each in pictures]
     assert seqs == sorted(seqs)
@@ -216,7 +206,7 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
         "compute_s": 11.0,
         "left.theta_std": 0.1,
     }
-    shown = {path: picture["row"][scene["columns"][path]] for path in expected}
+    shown = {path: picture["row"][COLUMNS[path]] for path in expected}
     assert shown == pytest.approx(expected, abs=1e-4)
     assert picture["row"][2] == picture["mode"] == "holding"
     assert picture["fault"] == ""
@@ -342,10 +332,10 @@ def test_other_hosts_and_origins_are_refused_and_no_other_port_is_open(served):
 
 def test_only_the_token_gives_access_to_commands(served):
     fake, viewed = served
-    token, stop = viewed.commanding.removeprefix(viewed.address), {"command": "stop"}
+    token, stop = viewed.query, {"command": "stop"}
     assert "STOP" in got(viewed.host, f"/{token}")[1]
     for query in ("", "?token=", "?token=None", "?token=%C3%A9", "?token=abc"):
-        status, body = got(viewed.host, f"/{query}")
+        status, body, _ = got(viewed.host, f"/{query}")
         assert status == 200
         assert "STOP" not in body
         assert "Watching" in body
@@ -368,11 +358,10 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         view(fake, "--timeout", "8") as viewed,
         Watcher(viewed.host) as page,
     ):
-        token = viewed.commanding.removeprefix(viewed.address)
 
         def press() -> str:
             """Send a command with the time of a current picture."""
-            return ask(viewed.host, token, {**grasp, "seen": page.next()["now"]})
+            return ask(viewed.host, viewed.query, {**grasp, "seen": page.next()["now"]})
 
         assert press() == "✓ grasp: ok"
         fake.replies["grasp"] = {
@@ -382,10 +371,10 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         assert press() == "✗ grasp: not accepted in mode disarmed; arm first"
         assert fake.requests == [grasp, grasp]
         late = {"seen": page.next()["now"] - 8.0}
-        assert ask(viewed.host, token, {**grasp, **late}).endswith("s behind")
-        assert ask(viewed.host, token, grasp).startswith('✗ grasp: expected "seen"')
+        assert ask(viewed.host, viewed.query, {**grasp, **late}).endswith("s behind")
+        assert ask(viewed.host, viewed.query, grasp).startswith('✗ grasp: expected "seen"')
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
-            assert ask(viewed.host, token, odd).startswith("✗ invalid command")
+            assert ask(viewed.host, viewed.query, odd).startswith("✗ invalid command")
         fake.close()
         assert "✗ grasp: no reply" in press()
         assert len(fake.requests) == 2
@@ -396,7 +385,7 @@ def test_other_machines_need_a_one_time_code() -> None:
     with FakeDaemon() as fake, view(fake, "--host", "127.0.0.2") as viewed:
         code = viewed.address.removeprefix(f"http://{viewed.host}")
         for path in ("/", "/?code=", "/?code=abc", "/?token=", "/?token=abc"):
-            status, body = got(viewed.host, path)
+            status, body, _ = got(viewed.host, path)
             assert status == 403
             assert "newest address" in body
             with pytest.raises(InvalidStatus, match="403"), Watcher(viewed.host):
@@ -443,7 +432,7 @@ def test_a_recording_can_be_shown_from_any_position(recorded):
                 rows = [row for row in kept.rows if row[0] >= picture["first"]]
                 assert len(rows) == pytest.approx(10 * place, abs=2)
                 for row in rows:
-                    force, was = row[kept.scene["columns"]["left.force"]], past[row[1]]
+                    force, was = row[COLUMNS["left.force"]], past[row[1]]
                     assert force == (pytest.approx(was, abs=1e-4) if math.isfinite(was) else None)
             assert playback.position == 1.5
             playback.ask("play")
@@ -510,9 +499,9 @@ def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline)
         save(tmp_path / "a.html", Recording(recorded), 1e-4, print)
     with pytest.raises(ViewError, match="No such file or directory"):
         save(tmp_path / "none" / "a.svg", Recording(recorded), 0.1, print)
-    RecordingWriter(tmp_path / "empty.mcap").close()
+    empty = write_recording(tmp_path / "empty.mcap")
     with pytest.raises(ViewError, match="the recording does not contain hand/state"):
-        save(tmp_path / "a.html", Recording(tmp_path / "empty.mcap"), 0.1, print)
+        save(tmp_path / "a.html", empty, 0.1, print)
     assert not (tmp_path / "a.html").exists()
     for words, message in (
         ((recorded, "--save", "a.gif"), "expected a name ending in .html or .svg, found 'a.gif'"),
@@ -543,6 +532,8 @@ def test_invalid_messages_are_tolerated() -> None:
     kept.pictures.take(schema.STATE, {**state(0.0, 5), **GOALS})
     kept.pictures.draw()
     assert kept.newest["mode"] == "holding"
+    facts = kept.newest["facts"]
+    assert facts[facts.index("Messages unreadable") + 1] == str(kept.pictures.unreadable)
 
 
 def test_states_are_queued_while_a_picture_is_drawn(context, addresses):

@@ -11,11 +11,10 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.tools.analysis.analyse import analyse, open_source
-from softfinger.tools.analysis.plot import load_run
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute, recorded_settings
-from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.golden_wire import sample
+from tests.harness.recorded_hand import write_recording
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "grasp_and_turn.mcap"
 SPOILT: dict[str, Any] = {
@@ -53,8 +52,7 @@ def settings_message() -> dict[str, Any]:
 
 def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
     """Write a recording of ten frames; if ``spoil`` is given, corrupt one frame."""
-    writer = RecordingWriter(path)
-    writer.add(schema.SETTINGS, settings_message())
+    messages = [(schema.SETTINGS, settings_message())]
     for k in range(10):
         message = frame(k)
         if spoil is not None and k == 5:
@@ -63,9 +61,9 @@ def recording(path: Path, spoil: tuple[str, Any] | None) -> Path:
                 del message[name]
             else:
                 message[name] = value
-        writer.add(schema.TACTILE, message)
-        writer.add(schema.STATE, {**sample(schema.STATE), "seq": k})
-    writer.close()
+        messages.append((schema.TACTILE, message))
+        messages.append((schema.STATE, {**sample(schema.STATE), "seq": k}))
+    write_recording(path, messages)
     return path
 
 
@@ -80,19 +78,16 @@ def test_a_malformed_frame_is_reported_and_omitted(tmp_path, spoil):
     source = open_source(path, Settings(), own=True)
     contacts = analyse(source, lambda _: None)
     assert contacts[0].t.size == 9
-    load_run(Recording(path), -np.inf, np.inf, lambda _: None)
+    assert Recording(path).states()["t"].size == 10
 
 
 @pytest.mark.parametrize("name", ["settings", "calibration_left"])
 def test_settings_without_text_are_reported(tmp_path, name):
-    path = tmp_path / "a.mcap"
-    writer = RecordingWriter(path)
     message = settings_message()
     del message[name]
-    writer.add(schema.SETTINGS, message)
-    writer.close()
+    found = write_recording(tmp_path / "a.mcap", [(schema.SETTINGS, message)])
     with pytest.raises(RecordingError, match="hand/settings does not contain"):
-        recorded_settings(Recording(path))
+        recorded_settings(found)
 
 
 def test_recorded_settings_cannot_name_files(tmp_path):
@@ -103,21 +98,18 @@ def test_recorded_settings_cannot_name_files(tmp_path):
             section[key] = "/dev/zero" if section[key] == "" else ("/dev/zero", "/dev/zero")
     text = Settings.model_validate(named).model_dump_json()
     assert text.count("/dev/zero") == 6
-    writer = RecordingWriter(tmp_path / "a.mcap")
-    writer.add(schema.SETTINGS, {**settings_message(), "settings": text})
-    writer.close()
-    assert recorded_settings(Recording(tmp_path / "a.mcap"))[0] == Settings()
+    message = {**settings_message(), "settings": text}
+    found = write_recording(tmp_path / "a.mcap", [(schema.SETTINGS, message)])
+    assert recorded_settings(found)[0] == Settings()
 
 
 @pytest.mark.parametrize("spoilt", ["seq", "t", "reading", "left", "timestamp"])
 def test_malformed_inputs_are_reported(tmp_path, spoilt):
-    writer = RecordingWriter(tmp_path / "a.mcap")
-    for topic, message in Recording(GOLDEN).messages(end=0.1):
+    messages = list(Recording(GOLDEN).messages(end=0.1))
+    for topic, message in messages:
         if topic == schema.INPUT:
             message[spoilt] = "none"
         elif topic == schema.COMMAND:
             message.pop("ok")
-        writer.add(topic, message)
-    writer.close()
     with pytest.raises(RecordingError, match="do not form complete ticks"):
-        recompute(Recording(tmp_path / "a.mcap"))
+        recompute(write_recording(tmp_path / "a.mcap", messages))

@@ -170,7 +170,8 @@ def test_servo_temperature_is_shown():
 
 
 def told(seq: int, when: float, text: str, again: bool = False) -> dict[str, Any]:
-    return fake_daemon.event(seq, "mode", text) | {"timestamp": when, "again": again}
+    times = {"timestamp": when, "mono_ns": int(1e9 * when)}
+    return fake_daemon.event(seq, "mode", text) | times | {"again": again}
 
 
 TEXTS = ["first", "second", "third"]
@@ -180,10 +181,8 @@ def test_repeated_events_are_shown_once_and_in_order():
     feed = StreamState()
     # The third event arrives as a new event before the events are repeated.
     give(feed, b"hand/event", told(3, 103.0, "third"))
-    for seq in (1, 2, 3):
-        give(
-            feed, b"hand/event", told(seq, 100.0 + seq, ("first", "second", "third")[seq - 1], True)
-        )
+    for seq, text in enumerate(TEXTS, 1):
+        give(feed, b"hand/event", told(seq, 100.0 + seq, text, True))
     assert [event.text for event in feed.events] == TEXTS
     assert [event.text for event in feed.news()] == ["third", "first", "second"]
     assert feed.news() == []

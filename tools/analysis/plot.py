@@ -7,7 +7,6 @@ states, and include the modulus factor that was estimated during grips.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,11 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.stream import read, to_columns
 from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
-from softfinger.daemon.wire import schema
 from softfinger.tools import style
 from softfinger.tools.arguments import add_range, to_stderr
 from softfinger.tools.extras import require
@@ -92,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     build_kernels(Settings(), print_event, FRAMES)
     with Progress("plot", recording.size) as progress:
-        data = load_run(recording, arguments.start, arguments.end, progress)
+        data = RecordedRun(recording, recording.states(arguments.start, arguments.end, progress))
     folder.mkdir(parents=True, exist_ok=True)
     with style.settings():
         for name, draw in PAGES.items():
@@ -109,23 +106,15 @@ class Missing(SoftfingerError):
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """All or part of a recording, in SI units.
+    """All or part of a recording; ``states`` contains the arrays of `Recording.states`."""
 
-    ``t`` is relative to the first message of the recording. ``states`` contains one array per
-    field. The fields are named as in the stream; the names of nested fields contain a dot.
-    """
-
-    name: str
-    models: tuple[FingerModel, FingerModel] | None
-    why_no_model: str
+    recording: Recording
     states: dict[str, NDArray[Any]]
-    zero: int  # daemon clock time at t = 0 [ns]
 
-    @cached_property
+    @property
     def t(self) -> FloatArray:
-        """Time [s] of each state, based on the daemon's monotonic clock."""
-        t: FloatArray = (self.states["mono_ns"] - self.zero) * 1e-9
-        return t
+        """Time of each state since the recording's first message [s]."""
+        return self.states["t"]
 
     @cached_property
     def fingers(self) -> tuple[str, ...]:
@@ -137,6 +126,18 @@ class RecordedRun:
         of = {name: self.states[f"{finger}.{name}"] for name in ("valid", "contact", "d")}
         return np.asarray(of["valid"] & of["contact"] & np.isfinite(of["d"]))
 
+    @cached_property
+    def models(self) -> tuple[FingerModel, FingerModel]:
+        """Finger models of the recorded settings. Raises Missing if the models can't be built."""
+        try:
+            return recorded_models(self.recording)
+        except RecordingError as error:
+            raise Missing(str(error).removeprefix(f"{self.recording.path}: ")) from None
+        except (SettingsError, TactileError, ValueError) as error:
+            raise Missing(
+                f"can't build the contact model from the recorded settings: {error}"
+            ) from None
+
     def contacts(self) -> dict[str, ContactTable]:
         """Return the table of each finger with a contact; raise Missing if there is no contact."""
         if not self.t.size:
@@ -144,35 +145,12 @@ class RecordedRun:
         touched = [name for name in self.fingers if self.touching(name).any()]
         if not touched:
             raise Missing("the recording does not contain a contact")
-        if self.models is None:
-            raise Missing(self.why_no_model)
         return {name: self.models[FINGERS.index(name)].table for name in touched}
-
-
-def load_run(
-    recording: Recording,
-    start: float,
-    end: float,
-    progress: Callable[[int], None] | None = None,
-) -> RecordedRun:
-    """Read the data between ``start`` and ``end`` [s]. Raises RecordingError."""
-    messages = recording.messages([schema.STATE], start, end, progress)
-    states = to_columns(read(schema.HandState, message) for _, message in messages)
-    return RecordedRun(recording.path.name, *_model(recording), states, recording.zero)
-
-
-def _model(recording: Recording) -> tuple[tuple[FingerModel, FingerModel] | None, str]:
-    try:
-        return recorded_models(recording), ""
-    except RecordingError as error:
-        return None, str(error).removeprefix(f"{recording.path}: ")
-    except (SettingsError, TactileError, ValueError) as error:
-        return None, f"can't build the contact model from the recorded settings: {error}"
 
 
 def _titled(figure: Figure, run: RecordedRun, text: str) -> None:
     """Add a title with the recording's name and ``text``."""
-    figure.suptitle(f"{run.name}: {text}", x=0.01, ha="left", fontsize=9.0)
+    figure.suptitle(f"{run.recording.path.name}: {text}", x=0.01, ha="left", fontsize=9.0)
 
 
 def draw_time(run: RecordedRun) -> Figure:

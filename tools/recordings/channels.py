@@ -42,6 +42,17 @@ _LEVELS = {"info": 2, "warning": 3, "error": 4}  # Foxglove's log levels, where 
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
 
 
+def flat(message: dict[str, Any], outer: str = "") -> dict[str, Any]:
+    """Flatten nested maps; the entry ``force`` in the map ``left`` becomes ``left.force``."""
+    fields: dict[str, Any] = {}
+    for key, value in message.items():
+        if isinstance(value, dict):
+            fields |= flat(value, f"{outer}{key}.")
+        else:
+            fields[f"{outer}{key}"] = value
+    return fields
+
+
 def channel_name(topic: bytes, message: dict[str, Any]) -> str:
     """Return a message's channel name, formed from the topic and, for a frame, the finger."""
     if topic == schema.TACTILE:
@@ -82,7 +93,8 @@ def from_json(topic: bytes) -> Converter:
     return partial(_restored, topic, floats, [field.name for field in fields])
 
 
-def _stamp(unix: object) -> dict[str, int]:
+def stamp(unix: object) -> dict[str, int]:
+    """Convert a Unix time [s] to Foxglove's form; an invalid time becomes 0."""
     if not isinstance(unix, float) or not 0.0 <= unix < 2.0**32:
         return {"sec": 0, "nsec": 0}
     seconds = math.floor(unix)
@@ -95,7 +107,7 @@ def _image(message: dict[str, Any]) -> dict[str, Any]:
     data = message.get("data")
     message["data"] = base64.b64encode(data).decode() if isinstance(data, bytes) else ""
     return {
-        "timestamp": _stamp(unix),
+        "timestamp": stamp(unix),
         "frame_id": message.get("finger"),
         "width": width,
         "height": height,
@@ -109,7 +121,7 @@ def _image(message: dict[str, Any]) -> dict[str, Any]:
 def _log(message: dict[str, Any]) -> dict[str, Any]:
     unix, severity = message.pop("timestamp", None), message.pop("level", None)
     return {
-        "timestamp": _stamp(unix),
+        "timestamp": stamp(unix),
         "level": _LEVELS.get(severity, 0) if isinstance(severity, str) else 0,
         "message": message.get("text"),
         "name": message.get("kind"),

@@ -19,6 +19,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.fields import KINDS
 from softfinger.tools.arguments import add_range, to_stderr
 from softfinger.tools.extras import require
+from softfinger.tools.recordings.channels import flat
 from softfinger.tools.recordings.reader import Recording
 
 _EPILOG = """\
@@ -173,7 +174,7 @@ def export(
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
             t = recording.time(message)
-            row = {"t": t} | _flat(message)
+            row = {"t": t} | flat(message)
             if topic not in tables:
                 name = _file_name(topic)
                 if any(each.stem == name for each in files):
@@ -199,17 +200,6 @@ def export(
 def _file_name(topic: bytes) -> str:
     """Convert a topic to a file name that is neither hidden nor in another folder."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", topic.decode()).lstrip(".")[:100] or "topic"
-
-
-def _flat(message: Row, outer: str = "") -> Row:
-    """Flatten nested maps; the entry ``force`` in the map ``left`` becomes ``left.force``."""
-    row: Row = {}
-    for key, value in message.items():
-        if isinstance(value, dict):
-            row |= _flat(value, f"{outer}{key}.")
-        else:
-            row[f"{outer}{key}"] = value
-    return row
 
 
 def _columns(topic: bytes, first: Row) -> dict[str, str]:

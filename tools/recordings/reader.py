@@ -62,12 +62,10 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     RecordingError
         If the file is not a recording or does not contain states.
     """
-    recording = Recording(Path(path))
-    states = [read(schema.HandState, message) for _, message in recording.messages({schema.STATE})]
-    if not states:
+    states = Recording(Path(path)).states()
+    if not states["t"].size:
         raise RecordingError(f"{path}: the recording does not contain {schema.STATE.decode()}")
-    columns = to_columns(states)
-    return {"t": (columns["mono_ns"] - recording.zero) * 1e-9, **columns}
+    return states
 
 
 class MessageSource(Protocol):
@@ -92,7 +90,7 @@ class Recording:
     ignored and counted in ``others``. ``say`` is called once for each kind of problem found.
     """
 
-    def __init__(self, path: Path, say: Callable[[str], None] | None = None) -> None:
+    def __init__(self, path: Path, say: Callable[[str], None] = lambda _: None) -> None:
         require("record")
         self.path = path
         self.truncated = False
@@ -130,7 +128,7 @@ class Recording:
                 f"profile {PROFILE!r} or channels of this stream, such as hand/state in "
                 f"JSON{damage}"
             )
-        if self.others and self._say is not None:
+        if self.others:
             names = ", ".join([*self.others][:_OTHERS_NAMED_MAX])
             more = ", …" if len(self.others) > _OTHERS_NAMED_MAX else ""
             self._say(
@@ -218,6 +216,17 @@ class Recording:
                 self._damaged(ValueError(f"an invalid {topic.decode()} message"))
                 continue
             yield topic, message
+
+    def states(
+        self,
+        start: float = -math.inf,
+        end: float = math.inf,
+        progress: Callable[[int], None] | None = None,
+    ) -> dict[str, NDArray[Any]]:
+        """Read the states as one array per field, with the time ``t``; see `read_recording`."""
+        messages = self.messages([schema.STATE], start, end, progress)
+        columns = to_columns(read(schema.HandState, message) for _, message in messages)
+        return {"t": (columns["mono_ns"] - self.zero) * 1e-9, **columns}
 
     def _messages(
         self, times: tuple[int, int] = (0, 2**64), progress: Callable[[int], None] | None = None
@@ -309,7 +318,7 @@ class Recording:
         usual = "the end of the file is missing" if self.truncated else "a chunk can't be read"
         # The MCAP library's messages about lengths and checksums would not help the user.
         self.damage = self.damage or (str(error) if type(error) is ValueError else "") or usual
-        if first and self._say is not None:
+        if first:
             what = "cut short" if self.truncated else "damaged"
             self._say(f"{self.path}: {what} ({self.damage}); only the intact part is read")
 

@@ -23,6 +23,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Frame
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import packer
+from softfinger.tools.recordings.channels import flat
 from softfinger.tools.recordings.reader import MessageSource, Recording
 
 if TYPE_CHECKING:
@@ -268,9 +269,12 @@ def _request(text: str) -> dict[str, Any] | None:
 
 def _compare(result: Comparison, recorded: dict[str, Any], recomputed: dict[str, Any]) -> None:
     result.states += 1
-    fields = 0
-    for name, before, after in _pairs(recorded, recomputed):
+    again, fields = flat(recomputed), 0
+    for name, before in flat(recorded).items():
+        if name in _TIMING:
+            continue
         fields += 1
+        after = again.get(name)
         if before == after or (before != before and after != after):
             continue
         seen = result.differences.get(name)
@@ -283,14 +287,3 @@ def _compare(result: Comparison, recorded: dict[str, Any], recomputed: dict[str,
             if not size <= seen.worst:
                 seen.worst, seen.worst_tick = (math.inf if math.isnan(size) else size), tick
     result.fields = max(result.fields, fields)
-
-
-def _pairs(
-    recorded: dict[str, Any], recomputed: dict[str, Any], outer: str = ""
-) -> Iterator[tuple[str, Any, Any]]:
-    for key, before in recorded.items():
-        after = recomputed.get(key)
-        if isinstance(before, dict) and isinstance(after, dict):
-            yield from _pairs(before, after, f"{outer}{key}.")
-        elif outer or key not in _TIMING:
-            yield f"{outer}{key}", before, after

@@ -19,6 +19,7 @@ from typing import Any, Self
 
 import zmq
 
+from softfinger.daemon.client.connection import subscribe
 from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.tools.arguments import (
     WAIT_MAX,
@@ -31,7 +32,12 @@ from softfinger.tools.arguments import (
 from softfinger.tools.stop_condition import StopCondition, available_signals
 from softfinger.tools.terminal.monitor_page import MonitorPage
 from softfinger.tools.terminal.status import describe
-from softfinger.tools.terminal.stream_state import Commander, StreamReader, StreamState, printable
+from softfinger.tools.terminal.stream_state import (
+    DRAIN_COUNT_MAX,
+    Commander,
+    StreamState,
+    printable,
+)
 from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGone
 
 STEP_ANGLE = math.radians(5.0)  # object rotation per arrow-key press [rad]
@@ -157,14 +163,14 @@ def run(args: argparse.Namespace) -> int:
     try:
         if keys is not None:
             keys.guard(context)
-        subscriber = StreamReader(context, state, feed)
+        socket = subscribe(context, state, *feed.topics, queue=DRAIN_COUNT_MAX)
         commander = Commander(context, commands, args.client)
         with _MonitorStop(args) as ending:
             if _is_page(args):
                 page = MonitorPage(feed, state, guarded=keys is not None)
-                _run_page(page, subscriber, commander, ending)
+                _run_page(page, socket, commander, ending)
             else:
-                _run_plain(state, subscriber, ending)
+                _run_plain(state, feed, socket, ending)
     except zmq.ZMQError as error:
         to_stderr("monitor")(f"{state}, {commands}: {error}")
         return 1
@@ -236,7 +242,7 @@ class _MonitorStop(StopCondition):
 
 
 def _run_page(
-    page: MonitorPage, subscriber: StreamReader, commander: Commander, ending: _MonitorStop
+    page: MonitorPage, socket: zmq.Socket[Any], commander: Commander, ending: _MonitorStop
 ) -> None:
     keyboard = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
     page.keys = keyboard is not None
@@ -246,7 +252,7 @@ def _run_page(
     try:
         while not ending.is_met:
             with terminal:
-                _page_loop(page, terminal, keyboard, subscriber, commander, ending)
+                _page_loop(page, terminal, keyboard, socket, commander, ending)
             # Ctrl-Z suspends this process, and the shell takes over the terminal.
             if ending.suspend and not ending.is_met:
                 ending.suspend = False
@@ -259,7 +265,7 @@ def _page_loop(
     page: MonitorPage,
     terminal: Terminal,
     keyboard: int | None,
-    subscriber: StreamReader,
+    socket: zmq.Socket[Any],
     commander: Commander,
     ending: _MonitorStop,
 ) -> None:
@@ -282,7 +288,7 @@ def _page_loop(
         if now < due:
             continue
         keys.settle()
-        subscriber.drain(now)
+        page.feed.drain(socket, now)
         commander.collect(now)
         ending.watch(page.feed, page.address, now)
         page.force = hand.force(now)
@@ -298,14 +304,15 @@ def _read(keyboard: int) -> bytes:
         return b""
 
 
-def _run_plain(address: str, subscriber: StreamReader, ending: _MonitorStop) -> None:
-    feed = subscriber.feed
+def _run_plain(
+    address: str, feed: StreamState, socket: zmq.Socket[Any], ending: _MonitorStop
+) -> None:
     with contextlib.suppress(BrokenPipeError):
         said_status, due = "live", 0.0
         while not ending.is_met:
             ending.wait(PLAIN_READ_INTERVAL)
             now = time.monotonic()
-            subscriber.drain(now)
+            feed.drain(socket, now)
             ending.watch(feed, address, now)
             status = feed.status(now)
             if status != said_status:

@@ -213,8 +213,9 @@ class MonitorPage:
     def _numbers(self, lines: int) -> list[Text]:
         """Draw headings, one row per quantity, and the object, all centred in ``lines`` lines."""
         rows = [self._row(*row) for row in _ROWS]
-        between = [Text()] if lines > len(rows) + 3 else []
-        block = [self._heads(), *between, *rows, *(each.copy() for each in between), self._object()]
+        if lines > len(rows) + 3:  # The headings and the object are set apart.
+            rows = [Text(), *rows, Text()]
+        block = [self._heads(), *rows, self._object()]
         above = (lines - len(block)) // 2
         block = [*(Text() for _ in range(above)), *block]
         return block + [Text() for _ in range(lines - len(block))]

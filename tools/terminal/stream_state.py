@@ -26,14 +26,8 @@ from softfinger.daemon.client.command_client import (
     UNCONFIRMED_TEXT,
     Attempts,
 )
-from softfinger.daemon.client.connection import (
-    REPLY_TIMEOUT,
-    SILENCE_TIME,
-    drain,
-    subscribe,
-    unpack,
-)
-from softfinger.daemon.client.stream import read
+from softfinger.daemon.client.connection import REPLY_TIMEOUT, SILENCE_TIME, drain, unpack
+from softfinger.daemon.client.stream import Gaps, read
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.local_stop import stop_locally
@@ -54,7 +48,8 @@ GLOSSARY = (  # meanings of the terms on the pages
 # Ratio of goal force to commanded force above which the page reports a force increase.
 _INCREASED_RATIO = 1.01
 # Maximum number of messages read per call, so that a flood of messages cannot block drawing.
-_DRAIN_COUNT_MAX = 4000
+DRAIN_COUNT_MAX = 4000
+INVALID = (ValueError, TypeError, RecursionError)  # raised by `StreamState.process`
 _MESSAGE_SIZE_MAX = 4_000_000  # maximum message size [bytes]; the largest frame has 131 kB
 
 
@@ -127,7 +122,7 @@ class StreamState:
         self.frames: dict[str, ShownFrame] = {}
         self.events: list[ShownEvent] = []
         self._news: deque[ShownEvent] = deque(maxlen=EVENT_COUNT_MAX)
-        self._event_times: deque[tuple[float, float]] = deque(maxlen=2 * EVENT_COUNT_MAX)
+        self.gaps = {topic: Gaps() for topic in schema.TOPICS}
         self.times: schema.LoopStatistics | None = None  # statistics of all ticks so far
         # A warning is shown if a servo is predicted to reach its temperature limit within this time
         # [s].
@@ -149,20 +144,24 @@ class StreamState:
             schema.SETTINGS: self._read_settings,
         }
 
+    def drain(self, socket: zmq.Socket[Any], now: float) -> None:
+        """Process the messages queued on ``socket``."""
+        for message in drain(socket, DRAIN_COUNT_MAX):
+            self.read(message, now)
+
     def read(self, message: list[bytes], now: float) -> None:
-        """Process one raw message."""
+        """Process one raw message; ignore a repetition."""
         try:
-            self.process(*unpack(message), now)
-        except ValueError:
+            topic, record = unpack(message)
+            if topic in self.topics and self.gaps[topic].take(record):
+                self.process(topic, record, now)
+        except INVALID:
             self.skipped_count += 1
 
     def process(self, topic: bytes, record: dict[str, Any], now: float) -> None:
-        """Process one unpacked message."""
-        try:
-            if topic in self.topics:
-                self.topics[topic](read(schema.TOPICS[topic].record, record), now)
-        except (ValueError, TypeError, RecursionError):
-            self.skipped_count += 1
+        """Process one unpacked message. Raises an error of `INVALID` for an invalid message."""
+        if topic in self.topics:
+            self.topics[topic](read(schema.TOPICS[topic].record, record), now)
 
     def _read_state(self, state: schema.HandState, now: float) -> None:
         before = self.state
@@ -194,12 +193,6 @@ class StreamState:
         )
 
     def _read_event(self, event: schema.Event, _: float) -> None:
-        # A late subscriber receives repeated events with their original seq and time. An event with
-        # the same seq but a different time was sent by a different daemon.
-        name = event.seq, event.timestamp
-        if event.again and name in self._event_times:
-            return
-        self._event_times.append(name)
         self._happened(event.timestamp, event.level, event.kind, event.text)
 
     def _happened(self, timestamp: float, *texts: str) -> None:
@@ -289,18 +282,6 @@ class StreamState:
     def rate(self) -> float:
         """Number of states per second, or NaN if unknown."""
         return 1.0 / self._period if self._period else math.nan
-
-
-class StreamReader:
-    """Subscriber socket that passes all queued messages to a `StreamState`."""
-
-    def __init__(self, context: zmq.Context[Any], address: str, feed: StreamState) -> None:
-        self.feed = feed
-        self._socket = subscribe(context, address, *feed.topics, queue=_DRAIN_COUNT_MAX)
-
-    def drain(self, now: float) -> None:
-        for message in drain(self._socket, _DRAIN_COUNT_MAX):
-            self.feed.read(message, now)
 
 
 class ShownReply(NamedTuple):

@@ -173,10 +173,9 @@ def _entity(name: str, part: DrawnPart, stamp: float) -> dict[str, Any]:
         | {"scale_invariant": True, "color": _colour(colour), "text": words}
         for colour, place, words in part.texts
     ]
-    time = {"sec": int(stamp), "nsec": int(stamp % 1.0 * 1e9)}
     others = ("metadata", "arrows", "cubes", "spheres", "cylinders", "triangles", "models")
     return (
-        {"timestamp": time, "frame_id": _FRAME, "id": name, "frame_locked": False}
+        {"timestamp": channels.stamp(stamp), "frame_id": _FRAME, "id": name, "frame_locked": False}
         | {"lifetime": {"sec": 0, "nsec": 0}, "lines": lines, "texts": texts}
         | {other: [] for other in others}
     )

@@ -21,7 +21,8 @@ import time
 import webbrowser
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 import msgpack
@@ -39,9 +40,11 @@ from softfinger.tools.terminal.stream_state import judge
 from softfinger.tools.viewing.document import document
 from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
 from softfinger.tools.viewing.pictures import Pictures, Row
-from softfinger.tools.viewing.recorder import PageRecorder
 from softfinger.tools.viewing.saved import save
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
+
+if TYPE_CHECKING:
+    from softfinger.tools.processes.child_processes import RecorderProcess
 
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
@@ -60,12 +63,8 @@ _HEADERS = {
 _say = to_stderr("view")
 
 
-class _Published(NamedTuple):
-    """Picture with the scene and the plot rows that belong to it."""
-
-    scene: str
-    picture: str
-    rows: list[Row]
+# Scene, picture, and the plot rows that belong to the picture.
+_Published = tuple[str, str, list[Row]]
 
 
 class Site:
@@ -85,7 +84,7 @@ class Site:
         send: Callable[[dict[str, Any], float], dict[str, Any]] | None,
         foxglove: Foxglove | None,
         stale: float,
-        announce: Callable[[str], None] | None = None,
+        announce: Callable[[str], None] | None,
     ) -> None:
         """Create a server; `run` serves the pages.
 
@@ -115,7 +114,7 @@ class Site:
 
     def publish(self, scene: str, picture: str, rows: list[Row]) -> None:
         """Send a picture to the waiting pages. Called from another thread."""
-        self._loop.call_soon_threadsafe(self._give, _Published(scene, picture, rows))
+        self._loop.call_soon_threadsafe(self._give, (scene, picture, rows))
 
     def announce(self) -> None:
         """If codes are used, create and announce a new one-time code."""
@@ -288,6 +287,56 @@ def _has(request: Request, name: str, secret: str) -> bool:
     """Return True if ``secret`` is the value of ``name`` in the request's query."""
     given = parse_qs(urlsplit(request.path).query).get(name, [""])[0]
     return secrets.compare_digest(given.encode(), secret.encode())
+
+
+class PageRecorder:
+    """Run one `softfinger record` process at a time, in the current folder.
+
+    ``show`` receives a map with the running recording's ``file`` and its start time ``since`` (Unix
+    time [s]). If the recording failed, the map contains the reason as ``failed``. If no recording
+    is running, the map is empty.
+    """
+
+    def __init__(self, address: str, keys: str, show: Callable[[dict[str, Any]], None]) -> None:
+        self._address = address
+        self._keys = keys
+        self._show = show
+        self._lock = threading.Lock()
+        self._process: RecorderProcess | None = None
+
+    def toggle(self) -> str:
+        """Start a recording, or end the running one; return a line that describes the result."""
+        try:
+            from softfinger.tools.processes.child_processes import RecorderError, RecorderProcess
+        except ImportError:  # This system has no termios.
+            return "✗ record: available only on Linux and macOS; use softfinger record instead"
+        with self._lock:
+            if (process := self._process) is not None:
+                return f"✓ {self._end(process)}"
+            path = Path(time.strftime("softfinger-%Y%m%d-%H%M%S.mcap")).absolute()
+            words = [str(path), "--address", self._address]
+            try:
+                self._process = RecorderProcess(words, path.exists, self._failed, self._keys)
+            except RecorderError as error:
+                return f"✗ record: {error}"
+            self._show({"file": path.name, "since": time.time()})
+            return f"✓ recording to {path}"
+
+    def close(self) -> None:
+        """End the running recording, if any."""
+        with self._lock:
+            if (process := self._process) is not None:
+                self._end(process)
+
+    def _end(self, process: RecorderProcess) -> str:
+        said = process.close()
+        self._process = None
+        self._show({})
+        return said
+
+    def _failed(self, why: str) -> None:
+        self._process = None
+        self._show({"failed": why})
 
 
 def listen(host: str, port: int | None) -> socket.socket:

@@ -21,7 +21,6 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from softfinger.daemon.client.stream import Gaps
 from softfinger.daemon.control.modes import COMMANDS, GRIPPING_MODES, Mode
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import geometry_of
@@ -30,7 +29,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.record_text import why_invalid
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.terminal import heatmap
-from softfinger.tools.terminal.stream_state import StreamState, number, printable, text
+from softfinger.tools.terminal.stream_state import INVALID, StreamState, number, printable, text
 from softfinger.tools.terminal.text_layout import format_value
 from softfinger.tools.viewing import hand_drawing
 from softfinger.tools.viewing.hand_drawing import GOAL, OBJECT, FloatArray, touches
@@ -62,15 +61,16 @@ class _Plot(NamedTuple):
     factor: float
     span: float
     paths: str  # `hand/state` fields
-    detail: bool = False  # True if the value is shown only on demand
+    detail: bool = False  # True if the plot is shown only on demand
+    headline: int | None = None  # decimals of the numbers above the plots, or None for no numbers
 
 
 _PLOTS = (
-    _Plot("Force", "N", 1.0, 2.0, "left.force right.force goal_force"),
-    _Plot("Object angle", "°", _DEGREE, 4.0, "object.angle goal_angle"),
-    _Plot("Displacement d", "mm", 1e3, 0.5, "left.d right.d"),
+    _Plot("Force", "N", 1.0, 2.0, "left.force right.force goal_force", headline=1),
+    _Plot("Object angle", "°", _DEGREE, 4.0, "object.angle goal_angle", headline=1),
+    _Plot("Object width", "mm", 1e3, 1.0, "object.width", True, headline=1),
+    _Plot("Displacement d", "mm", 1e3, 0.5, "left.d right.d", headline=2),
     _Plot("Tilt θ", "°", _DEGREE, 4.0, "left.theta right.theta"),
-    _Plot("Object width", "mm", 1e3, 1.0, "object.width", True),
     _Plot("Elastic energy", "mJ", 1e3, 2.0, "left.energy right.energy", True),
     _Plot("Joint angles", "°", _DEGREE, 2.0, "left.q right.q left.goal_q right.goal_q", True),
     _Plot(
@@ -82,12 +82,6 @@ _PLOTS = (
         True,
     ),
     _Plot("Loop times", "µs", 1e6, 50.0, "compute_s wake_late_s", True),
-)
-_HEADLINE = (  # title, decimals and plotted fields
-    ("Force", 1, "left.force right.force goal_force"),
-    ("Object angle", 1, "object.angle goal_angle"),
-    ("Object width", 1, "object.width"),
-    ("Displacement d", 2, "left.d right.d"),
 )
 _SERVOS = ("q", "current")  # fields that are not available without servos
 _DEVIATED = ("force", "d", "theta")  # finger fields whose standard deviation ({}_std) is also drawn
@@ -105,7 +99,7 @@ _FACTORS |= {
     for path, factor in _FACTORS.items()
     if path.rpartition(".")[2] in _DEVIATED
 }
-_COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # columns 0 to 2: number, time, mode
+COLUMNS = {path: 3 + k for k, path in enumerate(_FACTORS)}  # columns 0 to 2: number, time, mode
 _values = attrgetter(*_FACTORS)
 
 
@@ -115,7 +109,7 @@ def _row(number: int, state: HandState) -> list[Any]:
     for value, factor in zip(_values(state), _FACTORS.values(), strict=True):
         row.append(round(min(max(factor * value, -_NUMBER_MAX), _NUMBER_MAX), 4))
     if not state.object.valid:
-        row[_COLUMNS["object.angle"]] = row[_COLUMNS["object.width"]] = math.nan
+        row[COLUMNS["object.angle"]] = row[COLUMNS["object.width"]] = math.nan
     return row
 
 
@@ -165,7 +159,6 @@ class Pictures:
         self.states = 0  # number of states since the last `clear`
         self.time = math.nan  # Unix time of the newest state [s]
         self._truth: dict[str, Any] | None = None
-        self._gaps = {topic: Gaps() for topic in TOPICS}
         self._begin_rows()
 
     def _begin_rows(self) -> None:
@@ -179,10 +172,10 @@ class Pictures:
     def take(self, topic: bytes, message: Any) -> None:
         """Process one untrusted message."""
         stamp = number(message, "timestamp")
-        if topic not in self._gaps or not 0.0 <= stamp < 2.0**32:
+        if topic not in TOPICS or not 0.0 <= stamp < 2.0**32:
             self.unreadable += 1
             return
-        if not self._gaps[topic].take(message):
+        if not self.feed.gaps[topic].take(message):
             return
         if topic == schema.STATE:
             if number(message, "seq") < self.feed.state.seq:
@@ -202,7 +195,10 @@ class Pictures:
             if unknown:
                 self._say(f"unknown settings: {printable(', '.join(unknown))}")
             self._read_settings(settings)
-        self.feed.process(topic, message, self._moment())
+        try:
+            self.feed.process(topic, message, self._moment())
+        except INVALID:
+            self.unreadable += 1
         if self._foxglove is not None:
             self._foxglove.take(topic, message)
 
@@ -237,15 +233,8 @@ class Pictures:
         self._scene = {
             "live": self._live,
             "period": self._period,
-            "step": STEP,
             "panels": panels,
             "plots": [_described(plot, paths) for plot, paths in plots if paths],
-            "headline": [
-                (title, decimals, shown)
-                for title, decimals, paths in _HEADLINE
-                if (shown := [*filter(self._has, paths.split())])
-            ],
-            "columns": _COLUMNS,
             "palette": heatmap.colour_map(),
             "modes": [mode.value for mode in Mode],
             "commands": {name: list(each.modes) for name, each in COMMANDS.items()},
@@ -406,8 +395,8 @@ class Pictures:
         facts = [
             ("Age of the pressure maps", f"{each('frame_age_s', 1e3, 0)} ms"),
             ("Servos", f"{each('temperature', 1.0, 0)} °C, {each('voltage', 1.0, 1)} V"),
-            ("Messages lost", f"{sum(gaps.lost for gaps in self._gaps.values())}"),
-            ("Messages unreadable", f"{feed.skipped_count}"),
+            ("Messages lost", f"{sum(gaps.lost for gaps in feed.gaps.values())}"),
+            ("Messages unreadable", f"{self.unreadable}"),
             ("Loop overruns", f"{state.overruns}"),
         ]
         if times is not None:
@@ -426,12 +415,11 @@ def _described(plot: _Plot, paths: list[str]) -> dict[str, Any]:
     lines = []
     for path in paths:
         finger, _, key = path.rpartition(".")
-        goal = key.startswith("goal")
-        name, colour = _OTHERS.get(path, (f"{finger} goal".strip() if goal else finger, finger))
-        spread = _COLUMNS.get(f"{path}_std")
+        role = f"{finger} goal".strip() if key.startswith("goal") else finger
+        name, colour = _OTHERS.get(path, (role, finger))
+        spread = COLUMNS.get(f"{path}_std")
         lines.append(
-            {"name": name, "colour": colour or GOAL, "column": _COLUMNS[path]}
-            | {"spread": spread, "goal": goal}
+            {"name": name, "colour": colour or GOAL, "column": COLUMNS[path], "spread": spread}
         )
     return plot._asdict() | {"lines": lines}
 

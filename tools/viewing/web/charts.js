@@ -257,7 +257,7 @@ class Chart {
   }
 
   // Draw a line. If a pixel contains several rows, draw the lowest and the highest value.
-  line({ column, colour, goal }, rows, x, y) {
+  line({ column, colour }, rows, x, y) {
     const { pen, width } = this.surface, each = Math.max(1, Math.floor(rows.length / width));
     pen.beginPath();
     let gap = true;

@@ -180,12 +180,12 @@ function showControls() {
 // This page uses the keys of the terminal page. Space always stops the hand, even if a button has the focus.
 const KEYS = {
   a: ["arm", "Arm"], g: ["grasp", "Grasp"], r: ["release", "Release"], d: ["disarm", "Disarm"], c: ["clear", "Clear the fault"],
-  "+": ["", "More force"], "-": ["", "Less force"], ArrowLeft: ["", "Turn by −5°"], ArrowRight: ["", "Turn by +5°"],
+  "+": ["", "More force"], "-": ["", "Less force"], ArrowLeft: ["rotate", "Turn by −5°", -5], ArrowRight: ["rotate", "Turn by +5°", 5],
 };
 
 function commandKey({ key }) {
-  if (key in KEYS && KEYS[key][0]) press(KEYS[key][0]);
-  else if (key === "ArrowLeft" || key === "ArrowRight") press("rotate", key === "ArrowLeft" ? -5 : 5);
+  const [command, , value] = KEYS[key] ?? [];
+  if (command) press(command, value);
   else if (["+", "=", "-"].includes(key)) {
     const { force } = settings, step = key === "-" ? -0.5 : 0.5;
     force.want(Math.min(Math.max((force.wanted ?? force.value) + step, 0.5), +force.range.max));

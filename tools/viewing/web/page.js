@@ -1,6 +1,6 @@
 
 // Draw the pictures that the server sends. `tools.viewing.pictures` describes their contents.
-let scene, picture, palette, panels = [], charts = [], player, arrived = 0, connected = false, events = "";
+let scene, picture, palette, panels = [], charts = [], headline = [], player, arrived = 0, connected = false, events = "";
 const past = new History(), view = new View(() => redraw());
 const images = new Map();  // panel images
 
@@ -32,26 +32,20 @@ function layOut(next) {
     return made;
   });
   charts = scene.plots.map(plot => new Chart(one(plot.detail ? "#more .plots" : ".plots"), plot, past, view));
-  scene.headline = scene.headline.map(([title, decimals, paths]) => {
+  headline = scene.plots.filter(plot => plot.headline !== null).map(({ title, unit, headline: decimals, lines }) => {
     const box = make(one(".headline"), "div");
-    const lines = paths.map(path => lineOf(path)), row = (make(box, "h2", "", `${title}, ${lines[0].unit}`), make(box, "div"));
-    for (const line of lines) {
-      const cell = make(row, "p");
-      [line.value, line.aside] = [make(cell, "span"), make(cell, "small")];
-      line.value.style.color = `var(--${line.colour})`;
-    }
-    return { decimals, lines };
+    make(box, "h2", "", `${title}, ${unit}`);
+    const row = make(box, "div");
+    return { decimals, lines: lines.map(line => {
+      const cell = make(row, "p"), value = make(cell, "span"), aside = make(cell, "small");
+      value.style.color = `var(--${line.colour})`;
+      return { ...line, value, aside };
+    }) };
   });
   const colours = scene.modes.map(mode => `[data-mode=${mode}] { --mode: var(--${mode}) }`);
   put(one("#modes"), colours.join("\n"));
   scene.age = make(one(".headline"), "span", "age");
   if (settings.force && !picture) settings.force.value = scene.force_default;
-}
-
-function lineOf(path) {
-  const column = scene.columns[path];
-  for (const plot of scene.plots)
-    for (const line of plot.lines) if (line.column === column) return { ...line, unit: plot.unit };
 }
 
 // Draw an image's levels on a canvas of the same size. Levels beyond the palette are transparent.
@@ -71,7 +65,7 @@ function paint({ name, limits, equal, scaled, still: fixed = {}, surface, note, 
   if (equal) wide = tall = Math.min(wide, tall);
   const x = value => 0.5 * width + wide * (value - 0.5 * (left + right));
   const y = value => 0.5 * height + tall * Math.sign(bottom - top) * (value - 0.5 * (top + bottom));
-  const under = fixed.image ?? drawn.image, colour = named => named === "white" ? "#fff" : ink(named);
+  const under = fixed.image ?? drawn.image;
   pen.imageSmoothingEnabled = !!fixed.image;
   if (under) {
     if (!fixed.image || !images.has(name)) images.set(name, image(under, images.get(name)));
@@ -81,7 +75,7 @@ function paint({ name, limits, equal, scaled, still: fixed = {}, surface, note, 
   for (const [named, thick, points] of drawn.lines ?? []) {
     pen.beginPath();
     for (let k = 0; k < points.length; k += 2) pen.lineTo(x(points[k]), y(points[k + 1]));
-    pen.strokeStyle = colour(under ? `${named}-map` : named) || colour(named);
+    pen.strokeStyle = ink(under ? `${named}-map` : named);
     pen.lineWidth = scaled ? Math.max(0.7, wide * thick) : thick;
     pen.lineJoin = "round";
     pen.stroke();
@@ -89,7 +83,7 @@ function paint({ name, limits, equal, scaled, still: fixed = {}, surface, note, 
   for (const [named, px, py] of drawn.dots ?? []) {
     pen.beginPath();
     pen.arc(x(px), y(py), 4.5, 0, 7);
-    pen.fillStyle = colour(`${named}-map`);
+    pen.fillStyle = ink(`${named}-map`);
     pen.fill();
     [pen.strokeStyle, pen.lineWidth] = ["#fff", 1.5];
     pen.stroke();
@@ -101,7 +95,7 @@ function paint({ name, limits, equal, scaled, still: fixed = {}, surface, note, 
   }
   pen.font = "600 13px system-ui, sans-serif";
   for (const [named, px, py, text] of drawn.texts ?? []) {
-    pen.fillStyle = colour(named);
+    pen.fillStyle = ink(named);
     pen.fillText(text, x(px), y(py) + 4);
   }
   put(note, drawn.note ?? "");
@@ -119,7 +113,7 @@ function show() {
   one(".notes").title = notes.join("\n");
   const readable = performance.now() > (show.read ?? 0) + READABLE;
   if (readable) show.read = performance.now();
-  for (const { decimals, lines } of readable ? scene.headline : [])
+  for (const { decimals, lines } of readable ? headline : [])
     for (const { value, aside, name, column, spread } of lines) {
       const number = row?.[column], around = row?.[spread];
       put(value, typeof number === "number" ? decimal(number, decimals) : "—");
