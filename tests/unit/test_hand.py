@@ -53,7 +53,7 @@ def test_quasi_static_steering_gain(degrees, gain):
     # The joints are stiff and turn slowly, so the motion is quasi-static.
     parameters = hand.plant.parameters
     parameters.position_gain = 1e5
-    parameters.rate_gain = parameters.current_limit = parameters.stall_current = 1e3
+    parameters.rate_gain = parameters.stall_current = 1e3
     delta = math.radians(degrees)
     for share in np.linspace(0, 1, 400):
         for joint, sign in ((0, 1), (1, -1)):

@@ -36,13 +36,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     Plant,
     Stage,
 )
-from softfinger.daemon.simulation.physics.tip import (
-    D_MIN,
-    clear_contact,
-    contact_forces,
-    fade,
-    stiffen_by_rim,
-)
+from softfinger.daemon.simulation.physics.tip import D_MIN, clear_contact, contact_forces, fade
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
@@ -186,8 +180,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
             by_q1 += 1.0
         else:
             by_q2 -= 1.0
-        rim = rim_on_plane(p, tip)
-        tip.rim = max(rim, 0.0)
+        rim_on_plane(p, tip)
         tip.curvature = 0.0
         tip.travel = travel
         tip.rate_d = rate_d
@@ -195,8 +188,6 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
         tip.slip_rate = slide1 * q1_rate + slide2 * q2_rate
         tip.shear = now.extra_shear[CORNERS + finger]
         contact_forces(p, table, tip, 1.0)
-        if rim + travel > 0.0:
-            stiffen_by_rim(p, tip)
         tangent = tip.tangent
         tip.rows[ALONG_D, 0] = 0.5 * m1
         tip.rows[ALONG_D, 1] = -0.5 * m2

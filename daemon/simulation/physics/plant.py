@@ -29,6 +29,7 @@ from softfinger.daemon.simulation.physics.energy_guard import (
     shorten,
 )
 from softfinger.daemon.simulation.physics.forces import (
+    ELECTRIC_TIME,
     current_reference,
     evaluate_hand,
     evaluate_state,
@@ -76,9 +77,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
     i' = (r(q, ω) − i)/τ. Per unit of acceleration, the rate of the current decreases by (r_q g +
     r_ω) g/(τ + g). The step matrix contains this decrease.
     """
-    p = plant.parameters
-    lag = p.electric_time
-    constant = p.torque_constant
+    lag, constant = ELECTRIC_TIME, plant.parameters.torque_constant
     for j in range(2):
         reference = current_reference(plant, j, now.position[j], now.velocity[j])
         displacement = k.position[j]
@@ -244,15 +243,13 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     row.t = due
     for finger in range(2):
         now, before = sensed_contact_of(plant, finger), plant.sensed_contact[finger]
+        on_other_tip = senses_other_tip(plant, finger)
         # Do not interpolate between contacts with two different bodies.
-        same = senses_other_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
-        fraction = back if same else 0.0
+        fraction = back if on_other_tip == (plant.on_other_tip[finger] != 0) else 0.0
         row.d[finger] = now.d - fraction * (now.d - before.d)
         row.theta[finger] = now.theta - fraction * (now.theta - before.theta)
         row.gain[finger] = now.gain - fraction * (now.gain - before.gain)
-        row.relaxation_factor[finger] = plant.relaxation_factor[finger]
-        if senses_other_tip(plant, finger):
-            row.relaxation_factor[finger] = 1.0
+        row.relaxation_factor[finger] = 1.0 if on_other_tip else plant.relaxation_factor[finger]
         row.curvature[finger] = now.curvature
         row.tangential[finger] = now.tangential - fraction * (now.tangential - before.tangential)
     plant.sample_count += 1
