@@ -11,6 +11,7 @@ import random
 import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -214,11 +215,8 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
     FaultError
         If a word is invalid.
     """
-    return sorted((event for word in words for event in _parse(word.strip(), ids)), key=_after)
-
-
-def _after(event: FaultEvent) -> float:
-    return event.after
+    events = (event for word in words for event in _parse(word.strip(), ids))
+    return sorted(events, key=attrgetter("after"))
 
 
 def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:

@@ -92,7 +92,7 @@ class SerialReader:
         self._latest: Frame | None = None
         self._seq = 0
         self._bytes = 0
-        self._error = ""
+        self.error = ""  # reason why no frames arrive; empty while frames arrive
         self._port_lost = False
         self._event = threading.Event()  # set at the first frame or when the port is lost
         self._thread: threading.Thread | None = None
@@ -115,7 +115,7 @@ class SerialReader:
         self._latest, self._bytes = None, 0
         self._event.clear()
         self._port = open_port(self._path, self.settings.baud)
-        self._error, self._port_lost = "", False
+        self.error, self._port_lost = "", False
         self._stop = os.pipe()
         self._thread = threading.Thread(
             target=self._run,
@@ -146,11 +146,6 @@ class SerialReader:
             **self._decoder.counters(),
         }
 
-    @property
-    def error(self) -> str:
-        """Reason why no frames arrive; empty while frames arrive."""
-        return self._error
-
     def close(self) -> None:
         """Stop the thread and close the port.
 
@@ -173,7 +168,7 @@ class SerialReader:
 
     def _problem(self) -> str:
         if self._port_lost:
-            return self._error
+            return self.error
         within = f"within tactile.open_timeout = {self.settings.open_timeout:g} s"
         if self._bytes == 0:
             return (
@@ -206,7 +201,7 @@ class SerialReader:
             self._bytes += len(data)
             decoded = decoder.feed(data, self._clock.now())
             self._hand_over(decoded)
-            if decoder.lost and not self._error:
+            if decoder.lost and not self.error:
                 self._invalidate(decoder.diagnosis())
             if decoder.pending:
                 timeout = _GAP_TIME
@@ -243,11 +238,11 @@ class SerialReader:
         if self._latest is not None:
             sampled = max(sampled, self._latest.t_sample)
         self._latest = Frame(self._seq, sampled, decoded.t, True, decoded.data)
-        self._error = ""
+        self.error = ""
         self._event.set()
 
     def _invalidate(self, why: str) -> None:
-        self._error = why
+        self.error = why
         old = self._latest
         if old is not None and old.valid:
             self._seq += 1

@@ -244,7 +244,7 @@ class SensorModel:
             self._generator.standard_normal(out=self._normals)
         signal = self._signal + self._offset + self._lines[0][:, None] + self._lines[1]
         signal += flaws.tactile_noise / self._per_count * self._normals
-        count(signal, self._sensitivity > 0.0, self._ends, out)
+        count(signal, self.active, self._ends, out)
 
 
 # --- effects of a soft, resistive sensor ---------------------------------------------------------

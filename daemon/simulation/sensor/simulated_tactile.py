@@ -112,10 +112,10 @@ class SimulatedTactile:
 
         ``resyncs`` and ``skipped_bytes`` are always 0.
         """
-        arrivals = self._arrivals
+        missed = self._arrivals.missed + self._lost
         return {
-            "frames": arrivals.arrived - self._lost,
-            "missed": arrivals.missed + self._lost,
+            "frames": self._arrivals.number + 1 - missed,
+            "missed": missed,
             "resyncs": 0,
             "skipped_bytes": 0,
         }
@@ -220,7 +220,6 @@ class Arrivals:
         self._random = np.random.default_rng(seed)
         self.number = -1  # number of the newest frame
         self.arrival = start  # arrival time of the newest frame [s]
-        self.arrived = 0  # number of frames that have arrived
         self.missed = 0  # number of frames lost before the newest frame
         self._next = -1
         self.next_arrival = start + delay  # arrival time of the next frame [s]
@@ -233,7 +232,6 @@ class Arrivals:
             self.missed += self._next - self.number - 1
             self.number = self._next
             self.arrival = self.next_arrival
-            self.arrived += 1
             self._plan()
         return self.number > newest
 
