@@ -240,7 +240,6 @@ def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     back = min((plant.step_count * p.step - due) / p.step, 1.0)
     row = ring[plant.sample_count % len(ring)]
     row.number = plant.sample_count
-    row.t = due
     for finger in range(2):
         now, before = sensed_contact_of(plant, finger), plant.sensed_contact[finger]
         on_other_tip = senses_other_tip(plant, finger)

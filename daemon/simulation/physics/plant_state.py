@@ -55,8 +55,7 @@ class Motion(Record):
 class Sample(Record):
     """Tip contacts at the time when a frame is sampled; see :class:`TipContact`."""
 
-    number: int  # -1 for an empty entry
-    t: float  # time since the start [s]
+    number: int  # sample k is taken k / tactile.rate after the start; -1 for an empty entry
     d: Pair
     theta: Pair
     gain: Pair

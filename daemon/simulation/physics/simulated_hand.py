@@ -358,11 +358,6 @@ class SimulatedHand:
             return False
         return True
 
-    @property
-    def sample_count(self) -> int:
-        """Number of contact samples taken; sample k is taken at ``start`` + k / tactile.rate."""
-        return self.plant.sample_count
-
     def sample(self, number: int) -> Sample:
         """Return sample ``number``, which is valid until a newer sample replaces it.
 
@@ -371,8 +366,8 @@ class SimulatedHand:
         row = self._rows[number % len(self._rows)]
         if row.number != number:
             raise LookupError(
-                f"sample {number} is not stored; {self.sample_count} samples have been taken, and "
-                f"the latest {len(self._rows)} are stored"
+                f"sample {number} is not stored; {self.plant.sample_count} samples have been "
+                f"taken, and the latest {len(self._rows)} are stored"
             )
         return row
 

@@ -59,16 +59,13 @@ class SensorModel:
         dead: Sequence[tuple[int, int]] = (),
     ) -> None:
         self.grid = grid
-        self._flaws = flaws
-        self._per_count = board.pascal_per_count
+        self._board, self._flaws = board, flaws
         self._material, self._cells = material, grid.on(tip)
-        self._ends = (board.threshold, board.full_count)
         self._generator = np.random.Generator(np.random.SFC64(seed))
         shape = grid.shape
         deviations = self._generator.standard_normal(shape)
-        sensitivity = (
-            gain * np.maximum(1.0 + flaws.tactile_gain_spread * deviations, 0.0) / self._per_count
-        )
+        spread = np.maximum(1.0 + flaws.tactile_gain_spread * deviations, 0.0)
+        sensitivity = gain * spread / board.pascal_per_count
         for row, col in dead:
             sensitivity[row, col] = 0.0
         if flaws.tactile_dead > 0.0:
@@ -88,7 +85,6 @@ class SensorModel:
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
         self._warmer = np.zeros(1)  # relative gain drift
-        self._full_scale = board.full_count * board.pascal_per_count
         self._signal = np.zeros(shape)  # counts
         self._normals = np.zeros(shape)
         self._lines = (np.zeros(shape[0]), np.zeros(shape[1]))
@@ -165,7 +161,7 @@ class SensorModel:
             pressure[:] = lag(pressure, flaws.tactile_response, elapsed, self._response_lag)
         if flaws.tactile_drift > 0.0:
             self._generator.standard_normal(out=self._normals)
-            deviation = flaws.tactile_drift / self._per_count
+            deviation = flaws.tactile_drift / self._board.pascal_per_count
             drift(self._offset, deviation, flaws.tactile_drift_time, elapsed, self._normals)
         if flaws.tactile_gain_drift > 0.0:
             normal = self._generator.standard_normal(1)
@@ -222,29 +218,29 @@ class SensorModel:
         self, out: NDArray[np.uint16], faults: MeasurementFaults | None = None, t: float = 0.0
     ) -> None:
         """Apply the ``faults`` active at ``t`` [s], and write the cell counts to ``out``."""
-        flaws = self._flaws
+        flaws, board = self._flaws, self._board
         felt = self._pressure
         if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
-            felt = curve(felt, flaws.tactile_exponent, self._full_scale, flaws.tactile_fold)
+            full_scale = board.full_count * board.pascal_per_count
+            felt = curve(felt, flaws.tactile_exponent, full_scale, flaws.tactile_fold)
         np.multiply(felt, self._sensitivity, out=self._signal)
         if flaws.tactile_gain_drift > 0.0:
             self._signal *= np.maximum(1.0 + self._warmer, 0.0)
         if faults is not None:
-            faults.apply(self._signal, self._ends[1], t)
+            faults.apply(self._signal, board.full_count, t)
         if flaws.tactile_crosstalk > 0.0:
             crosstalk(self._signal, flaws.tactile_crosstalk, *self._lines)
         if flaws.tactile_row_noise > 0.0:
             rows = self._lines[0]
             if not flaws.tactile_crosstalk > 0.0:
                 rows[:] = 0.0
-            rows += self._generator.normal(
-                0.0, flaws.tactile_row_noise / self._per_count, rows.shape
-            )
+            deviation = flaws.tactile_row_noise / board.pascal_per_count
+            rows += self._generator.normal(0.0, deviation, rows.shape)
         if flaws.tactile_noise > 0.0:
             self._generator.standard_normal(out=self._normals)
         signal = self._signal + self._offset + self._lines[0][:, None] + self._lines[1]
-        signal += flaws.tactile_noise / self._per_count * self._normals
-        count(signal, self.active, self._ends, out)
+        signal += flaws.tactile_noise / board.pascal_per_count * self._normals
+        count(signal, self.active, (board.threshold, board.full_count), out)
 
 
 # --- effects of a soft, resistive sensor ---------------------------------------------------------

@@ -73,7 +73,6 @@ class SimulatedTactile:
             simulation.tactile_jitter,
             (simulation.seed, finger, 1),
         )
-        self._shape = (tactile.rows, tactile.cols)
         self._model = make_sensor_model(hand.settings, finger)
         self._radius = hand.settings.tip.radius
         self._solid = hand.settings.tip.physics == "solid"
@@ -145,7 +144,7 @@ class SimulatedTactile:
         last = round(self._faults("replay", t) / self._period)
         if last == 0 or not self._given:
             self._replayed = None
-            data: NDArray[np.uint16] = np.empty(self._shape, dtype=np.uint16)
+            data: NDArray[np.uint16] = np.empty(self._model.grid.shape, dtype=np.uint16)
             self._model.read(data, self._faults, t)
             return data
         if self._replayed is None:
