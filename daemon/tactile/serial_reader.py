@@ -11,6 +11,7 @@ import errno
 import math
 import os
 import select
+import termios
 import threading
 
 import serial
@@ -258,8 +259,8 @@ def open_port(path: str, baud: int) -> serial.Serial:
     """Open ``path`` exclusively in raw mode with 8 data bits and no parity. Raises TactileError."""
     try:
         return serial.Serial(path, baud, timeout=0, exclusive=True)
-    except serial.SerialException as error:
-        number = error.errno
+    except (OSError, ValueError, termios.error) as error:
+        number = error.errno if isinstance(error, OSError) else None
         if number == errno.ENOENT:
             why = "port not found; check that the board is connected"
             if not path.startswith("/dev/"):
@@ -270,6 +271,4 @@ def open_port(path: str, baud: int) -> serial.Serial:
             why = "the port is in use by another program: end that program first"
         else:
             why = f"can't be opened as a serial port ({error})"
-    except (OSError, ValueError) as error:
-        why = f"can't be opened as a serial port ({error})"
     raise TactileError(f"{path}: {why}")
