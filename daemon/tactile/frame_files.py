@@ -22,7 +22,7 @@ import math
 import re
 import zipfile
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -61,11 +61,11 @@ class FrameRecording:
     counts: NDArray[np.uint16]
     t: FloatArray
     live: NDArray[np.bool_]
-    truths: dict[str, FloatArray] = field(default_factory=dict)
+    truths: dict[str, FloatArray]
+    largest: float
+    whole: bool
     pitch: tuple[float, float] | None = None  # pitch in x and y [m], None if unknown
     full_count: int | None = None  # reading of saturated cells, None if unknown
-    largest: float = 0.0
-    whole: bool = True
     notes: tuple[str, ...] = ()
 
 
@@ -265,7 +265,7 @@ def _checked(
         t = _seconds(_row(arrays, "t", count), rate, notes)
     truths = {name: _row(arrays, name, count).astype(np.float64) for name in TRUTHS & arrays.keys()}
     counts = np.maximum(frames if whole else np.round(frames / scale), 0).astype(np.uint16)
-    return FrameRecording(counts, t, live, truths, None, None, largest, whole)
+    return FrameRecording(counts, t, live, truths, largest, whole)
 
 
 def _without_dead(

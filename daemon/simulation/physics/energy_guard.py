@@ -15,7 +15,7 @@ import math
 from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, STOP_STIFFNESS, Plant
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps of undamped tips
+_LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps of undamped tips
 # Relative rounding error of the energy. The error is large because d is the small difference
 # between two larger lengths.
 _ROUNDING = 3e-13
@@ -111,10 +111,11 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
     energy = moving + elastic_energy(plant) + weight
     work = work_done(plant)
     limit = plant.energy_limit + work
+    allowed = limit
     if was_on_rim or is_on_rim(plant):
         allowed = min(limit, plant.energy + work)
-    else:
-        allowed = limit + plant.parameters.tolerance * max(limit - weight, 0.0)
+    elif plant.parameters.loss == 0.0:
+        allowed += _LOSSLESS_TOLERANCE * max(limit - weight, 0.0)
     if energy <= allowed + _ROUNDING * (moving + abs(energy) + abs(weight)):
         plant.energy = energy
         plant.energy_limit = min(energy, limit)

@@ -92,7 +92,6 @@ class Parameters(Record):
     tips_relax: bool
     relaxation: FloatTriple  # stiffness of each Prony term relative to the long-term stiffness
     relaxation_step: FloatTriple  # fraction of each Prony term that relaxes per sub-step
-    tolerance: float  # relative energy gain allowed in smooth steps
     half_separation: float  # half the distance between the pivots [m]
     length: float  # finger length [m]
     offset: float  # tip offset from the finger axis [m]

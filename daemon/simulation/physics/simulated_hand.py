@@ -29,7 +29,6 @@ from softfinger.daemon.simulation.faults import (
     MeasurementFaults,
 )
 from softfinger.daemon.simulation.physics import plant
-from softfinger.daemon.simulation.physics.energy_guard import LOSSLESS_TOLERANCE
 from softfinger.daemon.simulation.physics.forces import TABLE_SPEED
 from softfinger.daemon.simulation.physics.plant_state import NO_OBJECT, Parameters, Plant, Sample
 from softfinger.daemon.simulation.physics.shapes import shape_of
@@ -99,7 +98,6 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
     p.tips_relax = any(simulation.tip_relaxation)
     p.relaxation[:] = simulation.tip_relaxation
     p.relaxation_step[:] = [-math.expm1(-step / each) for each in simulation.tip_relaxation_times]
-    p.tolerance = LOSSLESS_TOLERANCE if simulation.tip_loss == 0.0 else 0.0
     p.half_separation = 0.5 * settings.hand.pivot_separation
     p.length = settings.hand.finger_length
     p.offset = settings.hand.finger_offset
