@@ -341,6 +341,8 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
 
     Raises ValueError if the times do not increase.
     """
+    if t.dtype.kind in "ui":
+        t = t.astype(np.int64)  # The differences of unsigned or short integers would wrap around.
     first = t[0].item()
     since: FloatArray = (t - t[0]).astype(np.float64)
     steps = np.diff(since)
