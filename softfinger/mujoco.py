@@ -33,7 +33,7 @@ from softfinger.daemon.profile.factory import make_grid, make_material, make_tab
 from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
-from softfinger.daemon.simulation.physics.forces import current_reference
+from softfinger.daemon.simulation.physics.forces import ELECTRIC_TIME, current_reference
 from softfinger.daemon.simulation.physics.outline import rim_on_plane
 from softfinger.daemon.simulation.physics.plant import settle
 from softfinger.daemon.simulation.physics.plant_state import (
@@ -45,7 +45,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     TipContact,
 )
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand, set_parameters
-from softfinger.daemon.simulation.physics.tip import clear_contact, contact_forces, stiffen_by_rim
+from softfinger.daemon.simulation.physics.tip import clear_contact, contact_forces
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Record, Records
 from softfinger.kinematics.contact.table import ContactTable
@@ -163,11 +163,8 @@ def press(
         coupled = p.shear_coupling * math.tan(tip.theta)
         tip.shear = scale * along + dt * (rates[2] - coupled * rates[0])
         touch.shear_across = scale * across + dt * rates[3]
-        rim = rim_on_plane(p, tip)
-        tip.rim = max(rim, 0.0)
+        rim_on_plane(p, tip)
         force[first + 3] = _set_forces(p, data, touch, rates[3])
-        if rim + tip.travel > 0.0:
-            stiffen_by_rim(p, tip)
         rates[2] = tip.shear_rate
         rows[first + 2] -= tip.tangent * rows[first]
         force[first : first + _ROWS - 1] = tip.along
@@ -358,18 +355,19 @@ def hand_mjcf(settings: Settings, p: Parameters) -> str:
         cells = settings.tactile.rows * settings.tactile.cols
         sensors += f'<user name="{name}_tip_pressure" dim="{cells}" needstage="vel"/>'
     x, y = settings.simulation.object_position
+    width, height = settings.simulation.object_width, settings.simulation.object_height
     return f"""<mujoco model="softfinger"><compiler angle="radian" boundmass="1e-6"
  boundinertia="1e-9"/>
 <option timestep="{p.step}" integrator="implicitfast" gravity="{p.gravity[0]} {p.gravity[1]} 0"/>
 <default><geom contype="0" conaffinity="0" mass="0"/><general dyntype="filterexact"
- dynprm="{p.electric_time}" gainprm="{p.torque_constant}" actearly="true"/></default>
+ dynprm="{ELECTRIC_TIME}" gainprm="{p.torque_constant}" actearly="true"/></default>
 <worldbody>{fingers}
 <body pos="{x:.9g} {y:.9g} 0">
 <joint name="x" type="slide" axis="1 0 0" ref="{x:.9g}" frictionloss="{p.table_force:.9g}"/>
 <joint name="y" type="slide" axis="0 1 0" ref="{y:.9g}" frictionloss="{p.table_force:.9g}"/>
 <joint name="angle" axis="0 0 1" frictionloss="{p.table_torque:.9g}"/>
 <inertial pos="0 0 0" mass="{p.mass}" diaginertia="{p.inertia} {p.inertia} {p.inertia}"/>
-<geom name="object" type="box" size="{p.half_width:.9g} {p.half_height:.9g} 0.03"/>
+<geom name="object" type="box" size="{0.5 * width:.9g} {0.5 * height:.9g} 0.03"/>
 </body></worldbody>
 <actuator><general joint="left"/><general joint="right"/></actuator>
 <sensor>{sensors}</sensor></mujoco>"""
@@ -432,7 +430,7 @@ class MujocoHand(SimulatedHand):
                 mujoco.mj_step1(self.model, data)  # Compute the contacts that `feel` reads.
                 state.position[:], state.velocity[:] = data.qpos, data.qvel
                 state.current[:] = data.act
-                self._done = plant.step_count = self._done + 1
+                plant.step_count += 1
                 feel(plant.array, self.tips._all, self._ring)
 
 

@@ -11,6 +11,7 @@ import random
 import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -214,11 +215,8 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
     FaultError
         If a word is invalid.
     """
-    return sorted((event for word in words for event in _parse(word.strip(), ids)), key=_after)
-
-
-def _after(event: FaultEvent) -> float:
-    return event.after
+    events = (event for word in words for event in _parse(word.strip(), ids))
+    return sorted(events, key=attrgetter("after"))
 
 
 def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
@@ -266,28 +264,12 @@ def _number(text: str) -> float:
         return math.nan
 
 
-@dataclass(slots=True)
-class _Ramp:
-    """Value that changes linearly with time."""
-
-    before: float
-    after: float
-    begin: float  # s
-    over: float  # s
-
-    def __call__(self, t: float) -> float:
-        if t < self.begin:
-            return self.before
-        if t >= self.begin + self.over:
-            return self.after
-        return self.before + (self.after - self.before) * (t - self.begin) / self.over
-
-
 class MeasurementFaults:
     """Measurement faults of one finger's tactile sensor and servo current."""
 
     def __init__(self) -> None:
-        self._ramps: dict[str, _Ramp] = {}
+        # Initial value, final value, start time [s] and duration [s] of each change.
+        self._changes: dict[str, tuple[float, float, float, float]] = {}
 
     def begin(self, kind: str, value: float, t: float, over: float = 0.0) -> None:
         """Change a measurement fault linearly to ``value`` between ``t`` and ``t + over`` [s].
@@ -295,23 +277,29 @@ class MeasurementFaults:
         The change starts at the fault's value at ``t`` and replaces an unfinished change. Raises
         KeyError if ``kind`` is unknown.
         """
-        self._ramps[kind] = _Ramp(self(kind, t), value, t, over)
+        self._changes[kind] = self(kind, t), value, t, over
 
     def clear(self) -> None:
         """End all faults immediately."""
-        self._ramps.clear()
+        self._changes.clear()
 
     def __call__(self, kind: str, t: float) -> float:
         """Return the value of a fault at time ``t`` [s]."""
-        ramp = self._ramps.get(kind)
-        return MEASUREMENT_FAULTS[kind].honest if ramp is None else ramp(t)
+        if kind not in self._changes:
+            return MEASUREMENT_FAULTS[kind].honest
+        before, after, begin, over = self._changes[kind]
+        if t < begin:
+            return before
+        if t >= begin + over:
+            return after
+        return before + (after - before) * (t - begin) / over
 
     def apply(self, signal: FloatArray, full_count: int, t: float) -> None:
         """Apply the faults active at time ``t`` [s] to the sensor signal [rows, cols] in place.
 
         Shifts by a fraction of a cell are interpolated linearly.
         """
-        if not self._ramps:
+        if not self._changes:
             return
         if self("mirror", t) > 0.0:
             signal[:] = signal[:, ::-1].copy()

@@ -22,7 +22,7 @@ import math
 import re
 import zipfile
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -61,11 +61,11 @@ class FrameRecording:
     counts: NDArray[np.uint16]
     t: FloatArray
     live: NDArray[np.bool_]
-    truths: dict[str, FloatArray] = field(default_factory=dict)
+    truths: dict[str, FloatArray]
+    largest: float
+    whole: bool
     pitch: tuple[float, float] | None = None  # pitch in x and y [m], None if unknown
     full_count: int | None = None  # reading of saturated cells, None if unknown
-    largest: float = 0.0
-    whole: bool = True
     notes: tuple[str, ...] = ()
 
 
@@ -91,27 +91,22 @@ def load_recording(
     RecordingError
         If the recording cannot be read. The message names the file and the problem.
     """
+    notes: list[str] = []
     try:
-        found = _loaded(path, pascal_per_count, rate, noise)
+        if path.is_dir():
+            found = _checked(_folder(path), pascal_per_count, rate, noise, notes)
+        elif path.suffix == ".npz":
+            found = _checked(_archive(path, notes), pascal_per_count, rate, noise, notes)
+        elif path.suffix == ".npy":
+            found = _checked({"frames": _frames(path)}, pascal_per_count, rate, noise, notes)
+        else:
+            found = _export(path, pascal_per_count, rate, noise, notes)
         if found.full_count is None and (clipped := _clipped(found, pascal_per_count, full_count)):
-            found = replace(found, notes=(*found.notes, clipped))
-        return found
+            notes.append(clipped)
+        return replace(found, notes=tuple(notes))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise RecordingError(f"{path}: {reason}") from None
-
-
-def _loaded(path: Path, scale: float, rate: float, noise: float) -> FrameRecording:
-    notes: list[str] = []
-    if path.is_dir():
-        arrays = _folder(path)
-    elif path.suffix == ".npz":
-        arrays = _archive(path, notes)
-    elif path.suffix == ".npy":
-        arrays = {"frames": _frames(path)}
-    else:
-        return _export(path, scale, rate, noise)
-    return replace(_checked(arrays, scale, rate, noise, notes), notes=tuple(notes))
 
 
 def _folder(path: Path) -> dict[str, NDArray[Any]]:
@@ -228,17 +223,17 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
-def _export(path: Path, scale: float, rate: float, noise: float) -> FrameRecording:
+def _export(
+    path: Path, scale: float, rate: float, noise: float, notes: list[str]
+) -> FrameRecording:
     export = tekscan.parse(tekscan.decode(read_file(path)), 1.0 / rate)
     scale = 1.0 if export.raw else scale
-    notes: list[str] = []
-    arrays: dict[str, NDArray[Any]] = {"frames": export.values, "live": export.live}
-    found = replace(_checked(arrays, scale, rate, noise, notes), t=export.t, whole=export.raw)
-    if not math.isnan(sum(export.pitch)):
-        found = replace(found, pitch=export.pitch)
+    found = _checked({"frames": export.values, "live": export.live}, scale, rate, noise, notes)
+    full_count = None
     if math.isfinite(export.full):
-        found = replace(found, full_count=max(min(int(export.full / scale), _COUNT_MAX), 1))
-    return replace(found, notes=tuple(notes))
+        full_count = max(min(int(export.full / scale), _COUNT_MAX), 1)
+    pitch = None if math.isnan(sum(export.pitch)) else export.pitch
+    return replace(found, t=export.t, pitch=pitch, full_count=full_count, whole=export.raw)
 
 
 def _checked(
@@ -260,18 +255,17 @@ def _checked(
     _check_below(frames, live, noise / scale if whole else noise, notes)
     largest = float(frames[:, live].max())
     if largest > _COUNT_MAX * scale:
-        k, i, j = np.unravel_index(int(frames.argmax()), frames.shape)
         expected = f"at most {_COUNT_MAX} counts"
         if not whole and math.isfinite(largest):
             expected += f", set tactile.pascal_per_count to {largest / _COUNT_MAX:.3g} or more"
-        raise ValueError(_place(frames, int(k), int(i), int(j), expected))
+        raise _out_of_range(frames, frames.argmax(), expected)
     count = len(frames)
     t = np.arange(count) / rate
     if "t" in arrays:
         t = _seconds(_row(arrays, "t", count), rate, notes)
     truths = {name: _row(arrays, name, count).astype(np.float64) for name in TRUTHS & arrays.keys()}
     counts = np.maximum(frames if whole else np.round(frames / scale), 0).astype(np.uint16)
-    return FrameRecording(counts, t, live, truths, None, None, largest, whole)
+    return FrameRecording(counts, t, live, truths, largest, whole)
 
 
 def _without_dead(
@@ -283,10 +277,9 @@ def _without_dead(
         live = live & ~unknown.all(axis=0)
         if not live.any():
             raise ValueError(f"{_RANGE_ERROR}: every cell is NaN in all frames")
-        wrong = np.argwhere((unknown | np.isinf(frames)) & live)
-        if wrong.size:
-            k, i, j = wrong[0].tolist()
-            raise ValueError(_place(frames, k, i, j, "a number, or NaN in all frames"))
+        wrong = (unknown | np.isinf(frames)) & live
+        if wrong.any():
+            raise _out_of_range(frames, wrong.argmax(), "a number, or NaN in all frames")
     if not live.all():
         usable = live | ((frames >= 0) & (frames <= most))
         frames = np.where(usable, frames, np.zeros((), frames.dtype))
@@ -306,15 +299,15 @@ def _check_below(
     sample = frames[:: max(len(frames) // _SAMPLE_COUNT_MAX, 1)][:, live].astype(np.float64)
     middle = float(np.median(sample))
     noise = max(noise, 1.4826 * float(np.median(np.abs(sample - middle))))
-    k, i, j = np.unravel_index(int(frames.argmin()), frames.shape)
+    expected = ""
     if middle < -noise:
         expected = (
             f"0 or noise around 0; half of the readings are {middle:.3g} or less: tare the frames"
         )
-        raise ValueError(_place(frames, int(k), int(i), int(j), expected))
-    if lowest < -_NOISE_SIGMA_MAX * noise:
+    elif lowest < -_NOISE_SIGMA_MAX * noise:
         expected = f"at least {-_NOISE_SIGMA_MAX * noise:.3g}, the lower limit for noise around 0"
-        raise ValueError(_place(frames, int(k), int(i), int(j), expected))
+    if expected:
+        raise _out_of_range(frames, frames.argmin(), expected)
     share = np.count_nonzero(frames < 0) / (len(frames) * np.count_nonzero(live))
     notes.append(
         f"{share:.0%} of the readings are below 0, down to {lowest:.4g}: they are treated as "
@@ -322,11 +315,12 @@ def _check_below(
     )
 
 
-def _place(frames: NDArray[Any], k: int, i: int, j: int, expected: str) -> str:
-    value = frames[k, i, j].item()
-    return (
-        f"{_RANGE_ERROR}: frame {k + 1} of {len(frames)}, row "
-        f"{i + 1}, cell {j + 1} (frames[{k}, {i}, {j}]) is {value:.10g}, expected {expected}"
+def _out_of_range(frames: NDArray[Any], place: np.intp, expected: str) -> ValueError:
+    """Return the error for the reading at index ``place`` of the flattened frames."""
+    k, i, j = np.unravel_index(place, frames.shape)
+    return ValueError(
+        f"{_RANGE_ERROR}: frame {k + 1} of {len(frames)}, row {i + 1}, cell {j + 1} "
+        f"(frames[{k}, {i}, {j}]) is {frames[k, i, j]:.10g}, expected {expected}"
     )
 
 
@@ -347,6 +341,8 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
 
     Raises ValueError if the times do not increase.
     """
+    if t.dtype.kind in "ui":
+        t = t.astype(np.int64)  # The differences of unsigned or short integers would wrap around.
     first = t[0].item()
     since: FloatArray = (t - t[0]).astype(np.float64)
     steps = np.diff(since)
@@ -363,15 +359,10 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
             break
     else:
         factor = _factor(t, step, rate)
-    if factor in _UNITS:
+    if factor in _UNITS or not 1.0 / _INTERVAL_RATIO_NOTED < step * rate < _INTERVAL_RATIO_NOTED:
         notes.append(
-            f"t: interpreted as {_UNITS[factor]}, which gives {step * factor:.4g} s between "
-            f"frames, but tactile.rate corresponds to {1.0 / rate:.4g} s"
-        )
-    elif not 1.0 / _INTERVAL_RATIO_NOTED < step * rate < _INTERVAL_RATIO_NOTED:
-        notes.append(
-            f"t: interpreted as seconds, which gives {step:.4g} s between frames, but tactile.rate "
-            f"corresponds to {1.0 / rate:.4g} s"
+            f"t: interpreted as {_UNITS.get(factor, 'seconds')}, which gives {step * factor:.4g} s "
+            f"between frames, but tactile.rate corresponds to {1.0 / rate:.4g} s"
         )
     return np.multiply(since, factor)
 

@@ -20,13 +20,12 @@ from softfinger.daemon.tactile.decoder import Decoded, DelimitedDecoder
 from softfinger.daemon.tactile.serial_reader import SerialReader
 
 _OFFSET = 11
-_BITS = 5  # bits per half of a count
 
 
 class GloveDecoder(DelimitedDecoder):
     """Decoder for a glove-style board, which sends each count in two halves of ``bits`` bits."""
 
-    def __init__(self, rows: int = 32, cols: int = 32, bits: int = _BITS) -> None:
+    def __init__(self, rows: int = 32, cols: int = 32, bits: int = 5) -> None:
         super().__init__(rows, cols, b"\n", 2 + 2 * rows * cols)
         self._values = 1 << bits  # number of possible values per half
 
@@ -51,7 +50,7 @@ class GloveDecoder(DelimitedDecoder):
 
 def bits_of(full_count: int) -> int:
     """Return the number of bits per half of a count, given the board's maximum count."""
-    return _BITS + 1 if 1 << 2 * _BITS <= full_count < 1 << 2 * (_BITS + 1) else _BITS
+    return 6 if 1024 <= full_count < 4096 else 5
 
 
 class Glove(SerialReader):

@@ -131,16 +131,18 @@ class ReplayTactile:
         if now < self._due:
             return self._frame
         turn = math.floor((now - self._start) / self._period)
-        if turn and not self._again:
-            return self._end()
+        ended = turn > 0 and not self._again
+        if ended:
+            turn = 0
         begin = self._start + turn * self._period
         count = len(self._times)
         k = max(bisect.bisect_right(self._times, now - begin) - 1, 0)
         arrival = begin + self._times[k]
-        self._due = begin + (self._times[k + 1] if k + 1 < count else self._period)
+        due = begin + (self._times[k + 1] if k + 1 < count else self._period)
+        self._due = math.inf if ended else due
+        seq = turn * count + k + 1 + ended
         data = self._recording.counts[k]
-        seq = turn * count + k + 1
-        self._frame = Frame(seq, arrival - self._latency, arrival, True, data)
+        self._frame = Frame(seq, arrival - self._latency, arrival, not ended, data)
         return self._frame
 
     def counters(self) -> dict[str, int]:
@@ -151,13 +153,3 @@ class ReplayTactile:
     def close(self) -> None:
         """Stop delivering frames."""
         self._due = math.inf
-
-    def _end(self) -> Frame | None:
-        self._due = math.inf
-        old = self._frame
-        if old is not None:
-            data = self._recording.counts[-1]
-            arrival = self._start + self._times[-1]
-            seq = len(self._times) + 1
-            self._frame = Frame(seq, arrival - self._latency, arrival, False, data)
-        return self._frame

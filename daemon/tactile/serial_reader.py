@@ -11,6 +11,7 @@ import errno
 import math
 import os
 import select
+import termios
 import threading
 
 import serial
@@ -92,7 +93,7 @@ class SerialReader:
         self._latest: Frame | None = None
         self._seq = 0
         self._bytes = 0
-        self._error = ""
+        self.error = ""  # reason why no frames arrive; empty while frames arrive
         self._port_lost = False
         self._event = threading.Event()  # set at the first frame or when the port is lost
         self._thread: threading.Thread | None = None
@@ -115,7 +116,7 @@ class SerialReader:
         self._latest, self._bytes = None, 0
         self._event.clear()
         self._port = open_port(self._path, self.settings.baud)
-        self._error, self._port_lost = "", False
+        self.error, self._port_lost = "", False
         self._stop = os.pipe()
         self._thread = threading.Thread(
             target=self._run,
@@ -146,11 +147,6 @@ class SerialReader:
             **self._decoder.counters(),
         }
 
-    @property
-    def error(self) -> str:
-        """Reason why no frames arrive; empty while frames arrive."""
-        return self._error
-
     def close(self) -> None:
         """Stop the thread and close the port.
 
@@ -173,7 +169,7 @@ class SerialReader:
 
     def _problem(self) -> str:
         if self._port_lost:
-            return self._error
+            return self.error
         within = f"within tactile.open_timeout = {self.settings.open_timeout:g} s"
         if self._bytes == 0:
             return (
@@ -206,7 +202,7 @@ class SerialReader:
             self._bytes += len(data)
             decoded = decoder.feed(data, self._clock.now())
             self._hand_over(decoded)
-            if decoder.lost and not self._error:
+            if decoder.lost and not self.error:
                 self._invalidate(decoder.diagnosis())
             if decoder.pending:
                 timeout = _GAP_TIME
@@ -243,11 +239,11 @@ class SerialReader:
         if self._latest is not None:
             sampled = max(sampled, self._latest.t_sample)
         self._latest = Frame(self._seq, sampled, decoded.t, True, decoded.data)
-        self._error = ""
+        self.error = ""
         self._event.set()
 
     def _invalidate(self, why: str) -> None:
-        self._error = why
+        self.error = why
         old = self._latest
         if old is not None and old.valid:
             self._seq += 1
@@ -263,8 +259,8 @@ def open_port(path: str, baud: int) -> serial.Serial:
     """Open ``path`` exclusively in raw mode with 8 data bits and no parity. Raises TactileError."""
     try:
         return serial.Serial(path, baud, timeout=0, exclusive=True)
-    except serial.SerialException as error:
-        number = error.errno
+    except (OSError, ValueError, termios.error) as error:
+        number = error.errno if isinstance(error, OSError) else None
         if number == errno.ENOENT:
             why = "port not found; check that the board is connected"
             if not path.startswith("/dev/"):
@@ -275,6 +271,4 @@ def open_port(path: str, baud: int) -> serial.Serial:
             why = "the port is in use by another program: end that program first"
         else:
             why = f"can't be opened as a serial port ({error})"
-    except (OSError, ValueError) as error:
-        why = f"can't be opened as a serial port ({error})"
     raise TactileError(f"{path}: {why}")

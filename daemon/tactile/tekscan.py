@@ -39,13 +39,6 @@ _LENGTHS = {
 }
 _TIMES = {**dict.fromkeys(("", "s", "sec", "seconds"), 1.0), "ms": 1e-3, "msec": 1e-3}
 _RAW = ("raw", "rawsum", "rawdata", "counts", "count", "")
-_PRESSURES = {
-    **{"pa": 1.0, "hpa": 1e2, "kpa": 1e3, "mpa": 1e6, "bar": 1e5, "mbar": 1e2},
-    **{"psi": 6894.757293168, "ksi": 6894757.293168, "psf": 47.88025898},
-    **{"atm": 101325.0, "at": 98066.5, "torr": 133.322368421},
-    **{"mmhg": 133.322387415, "cmhg": 1333.22387415, "inhg": 3386.389},
-    **{"mmh2o": 9.80665, "cmh2o": 98.0665, "inh2o": 249.08891},
-}
 _FORCES = {
     **{"n": 1.0, "mn": 1e-3, "kn": 1e3, "dyn": 1e-5},
     **dict.fromkeys(("g", "gf", "gram", "grams", "p"), 9.80665e-3),
@@ -54,6 +47,18 @@ _FORCES = {
     **dict.fromkeys(("oz", "ozf"), 0.27801385095),
 }
 _AREAS = {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6, "in2": 0.0254**2, "ft2": 0.3048**2}
+_PRESSURES = {
+    **{"pa": 1.0, "hpa": 1e2, "kpa": 1e3, "mpa": 1e6, "bar": 1e5, "mbar": 1e2},
+    **{"psi": 6894.757293168, "ksi": 6894757.293168, "psf": 47.88025898},
+    **{"atm": 101325.0, "at": 98066.5, "torr": 133.322368421},
+    **{"mmhg": 133.322387415, "cmhg": 1333.22387415, "inhg": 3386.389},
+    **{"mmh2o": 9.80665, "cmh2o": 98.0665, "inh2o": 249.08891},
+    **{
+        f"{force}/{area}": newton / square
+        for force, newton in _FORCES.items()
+        for area, square in _AREAS.items()
+    },
+}
 # Notations of squares. The byte that means ² in DOS code pages means ý in Latin-1.
 _SQUARES = str.maketrans({"²": "2", "ý": "2", "^": "", ".": "", "*": ""})
 
@@ -82,9 +87,8 @@ class Export:
 
 def decode(data: bytes) -> str:
     """Decode text in UTF-8, UTF-16 or a single-byte encoding, with or without a byte order mark."""
-    for mark, code in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
-        if data.startswith(mark):
-            return data.decode(code, "replace")
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace")
     zeros = data[:200].count(0)
     if zeros > 0.3 * len(data[:200]):
         return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be", "replace")
@@ -120,7 +124,7 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
         rounding = 0.5 * factor * 10.0 ** -_digits(values)
         values *= factor
         if "SATURATION_PRESSURE" in header:
-            units = {**_PRESSURES, "": factor, **_per_area()}
+            units = {**_PRESSURES, "": factor}
             full = _SATURATION_FRACTION * _quantity(header, "SATURATION_PRESSURE", units) - rounding
     step = seconds_per_frame
     if "SECONDS_PER_FRAME" in header:
@@ -329,8 +333,8 @@ def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
     unit = _plain_unit(text)
     if unit in _RAW:
         return 0.0
-    if unit in _PRESSURES or unit in _per_area():
-        return (_PRESSURES | _per_area())[unit]
+    if unit in _PRESSURES:
+        return _PRESSURES[unit]
     if unit in _FORCES:  # The unit is a force per cell.
         area = _quantity(header, "SENSEL_AREA", _AREAS) if "SENSEL_AREA" in header else math.nan
         area = pitch[0] * pitch[1] if math.isnan(area) else area
@@ -338,14 +342,6 @@ def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
             return _FORCES[unit] / area
         raise TekscanError(f"UNITS: found {text!r}, a unit of force, which requires SENSEL_AREA")
     raise TekscanError(f"UNITS: found {text!r}, expected RAW or a unit of pressure")
-
-
-def _per_area() -> dict[str, float]:
-    return {
-        f"{force}/{area}": newton / square
-        for force, newton in _FORCES.items()
-        for area, square in _AREAS.items()
-    }
 
 
 def _plain_unit(unit: str) -> str:

@@ -1,5 +1,7 @@
 """Test the FlexiTac backend on real ptys through pyserial."""
 
+import errno
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -111,6 +113,14 @@ def test_a_port_that_cannot_be_opened_is_reported(tmp_path, board):
         assert "the port is in use by another program" in why_not_open(sensor(board.path))
     board.stream(lambda k: bytes(1024))
     assert "no AA 55 marker" in why_not_open(sensor(board.path, timeout=5.0))
+
+
+def test_a_port_that_is_lost_while_it_is_opened_is_reported(board, monkeypatch):
+    def lost(_port: object, _queue: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(termios, "tcflush", lost)
+    assert "can't be opened as a serial port" in why_not_open(sensor(board.path))
 
 
 def test_a_silent_port_is_reported_with_its_name_and_time_out(own_threads, board):

@@ -351,9 +351,16 @@ def test_times_as_texts_are_reported(press, tmp_path):
         load_recording(tmp_path / "a.npz", SCALE, 25.0)
 
 
-def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path):
-    np.savez(tmp_path / "a.npz", frames=press, t=np.array([0, 1, 2, 3, 3, 4, 5, 6]) * 0.01)
-    with pytest.raises(RecordingError, match=r"t\[3\] = 0\.03, t\[4\] = 0\.03"):
+@pytest.mark.parametrize(
+    ("t", "told"),
+    [
+        (np.array([0, 1, 2, 3, 3, 4, 5, 6]) * 0.01, r"t\[3\] = 0\.03, t\[4\] = 0\.03"),
+        (np.array([90, 10, 20, 30, 40, 50, 60, 70], np.uint32), r"t\[0\] = 90, t\[1\] = 10"),
+    ],
+)
+def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path, t, told):
+    np.savez(tmp_path / "a.npz", frames=press, t=t)
+    with pytest.raises(RecordingError, match=told):
         load_recording(tmp_path / "a.npz", SCALE, 100.0)
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.simulation.emulator.pty_bus import PtyPort
 from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
 from softfinger.daemon.tactile import cobs
+from softfinger.daemon.tactile.glove import bits_of
 from softfinger.daemon.types import Frame
 
 # Maximum number of unread bytes. A tty reports at most 4095 unread bytes, so this limit must be
@@ -213,8 +214,8 @@ def encode_glove(
 
 def encoder_for(backend: str, full_count: int) -> Encoder:
     """Return the encoder for a backend's board; ``full_count`` is the board's maximum count."""
-    if backend == "glove" and 1023 < full_count <= 4095:
-        return Encoder(partial(encode_glove, values=64), b"a")
+    if backend == "glove":
+        return Encoder(partial(encode_glove, values=1 << bits_of(full_count)), b"a")
     return ENCODERS[backend]
 
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, Plant
+from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, STOP_STIFFNESS, Plant
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
-LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps of undamped tips
+_LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps of undamped tips
 # Relative rounding error of the energy. The error is large because d is the small difference
 # between two larger lengths.
 _ROUNDING = 3e-13
@@ -49,7 +49,7 @@ def elastic_energy(plant: Plant) -> float:
         q = plant.state.position[finger]
         beyond = min(q - p.stop_low[finger], 0.0)
         beyond += max(q - p.stop_high[finger], 0.0)
-        energy += 0.5 * p.stop_stiffness * beyond * beyond
+        energy += 0.5 * STOP_STIFFNESS * beyond * beyond
         gears = plant.gears[finger]
         deflection = gears.limited_deflection
         energy += 0.5 * gears.friction / p.presliding * deflection * deflection
@@ -62,10 +62,10 @@ def elastic_energy(plant: Plant) -> float:
 def is_on_rim(plant: Plant) -> bool:
     """Return True if the rim of a backing plate is in contact."""
     stage = plant.stages[0]
-    depth = 0.0
     for finger in range(2):
-        depth += stage.on_object[finger].rim + stage.on_tip[finger].rim
-    return bool(depth > 0.0)
+        if stage.on_object[finger].rim > 0.0 or stage.on_tip[finger].rim > 0.0:
+            return True
+    return False
 
 
 @inner_kernel
@@ -111,10 +111,11 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
     energy = moving + elastic_energy(plant) + weight
     work = work_done(plant)
     limit = plant.energy_limit + work
+    allowed = limit
     if was_on_rim or is_on_rim(plant):
         allowed = min(limit, plant.energy + work)
-    else:
-        allowed = limit + plant.parameters.tolerance * max(limit - weight, 0.0)
+    elif plant.parameters.loss == 0.0:
+        allowed += _LOSSLESS_TOLERANCE * max(limit - weight, 0.0)
     if energy <= allowed + _ROUNDING * (moving + abs(energy) + abs(weight)):
         plant.energy = energy
         plant.energy_limit = min(energy, limit)

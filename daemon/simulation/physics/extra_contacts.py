@@ -36,13 +36,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     Plant,
     Stage,
 )
-from softfinger.daemon.simulation.physics.tip import (
-    D_MIN,
-    clear_contact,
-    contact_forces,
-    fade,
-    stiffen_by_rim,
-)
+from softfinger.daemon.simulation.physics.tip import D_MIN, clear_contact, contact_forces, fade
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
@@ -134,22 +128,15 @@ def touch_palm(
 
 
 @inner_kernel
-def tips_are_far(plant: Plant) -> bool:
-    """Return True if the tips are so far apart that their contact is not evaluated."""
-    left, right = plant.fingers[0], plant.fingers[1]
-    apart_x = right.x - left.x
-    apart_y = right.y - left.y
-    far = 2.0 * _DISTANCE_MAX * plant.parameters.radius
-    return bool(apart_x * apart_x + apart_y * apart_y > far * far)
+def tip_on_tip(
+    plant: Plant, table: Table, now: Motion, stage: Stage, apart_x: float, apart_y: float
+) -> bool:
+    """Evaluate the tip-to-tip contact and add its torques; return True if the tips may touch.
 
-
-@inner_kernel
-def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
-    """Evaluate the tip-to-tip contact and add its torques; return True if the tips may touch."""
+    (apart_x, apart_y) is the vector from the left to the right tip's centre [m].
+    """
     p = plant.parameters
     left, right = plant.fingers[0], plant.fingers[1]
-    apart_x = right.x - left.x
-    apart_y = right.y - left.y
     apart = math.sqrt(apart_x * apart_x + apart_y * apart_y)
     half = 0.5 * apart
     d = p.radius - half
@@ -186,8 +173,7 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
             by_q1 += 1.0
         else:
             by_q2 -= 1.0
-        rim = rim_on_plane(p, tip)
-        tip.rim = max(rim, 0.0)
+        rim_on_plane(p, tip)
         tip.curvature = 0.0
         tip.travel = travel
         tip.rate_d = rate_d
@@ -195,8 +181,6 @@ def tip_on_tip(plant: Plant, table: Table, now: Motion, stage: Stage) -> bool:
         tip.slip_rate = slide1 * q1_rate + slide2 * q2_rate
         tip.shear = now.extra_shear[CORNERS + finger]
         contact_forces(p, table, tip, 1.0)
-        if rim + travel > 0.0:
-            stiffen_by_rim(p, tip)
         tangent = tip.tangent
         tip.rows[ALONG_D, 0] = 0.5 * m1
         tip.rows[ALONG_D, 1] = -0.5 * m2
@@ -219,8 +203,11 @@ def touch_each_other(plant: Plant, table: Table, now: Motion, stage: Stage, is_f
 
     In the first stage, this function also sets the tip-to-tip rows in the step matrix.
     """
-    near = not tips_are_far(plant) or plant.parameters.shape == NO_OBJECT
-    touching = near and tip_on_tip(plant, table, now, stage)
+    apart_x = plant.fingers[1].x - plant.fingers[0].x
+    apart_y = plant.fingers[1].y - plant.fingers[0].y
+    far = 2.0 * _DISTANCE_MAX * plant.parameters.radius
+    near = apart_x**2 + apart_y**2 <= far**2 or plant.parameters.shape == NO_OBJECT
+    touching = near and tip_on_tip(plant, table, now, stage, apart_x, apart_y)
     for finger in range(2):
         tip = stage.on_tip[finger]
         stage.extra_rate[CORNERS + finger] = tip.shear_rate if touching else 0.0

@@ -15,6 +15,7 @@ from softfinger.daemon.simulation.physics.extra_contacts import (
 )
 from softfinger.daemon.simulation.physics.plant_state import (
     NO_OBJECT,
+    STOP_STIFFNESS,
     Motion,
     Plant,
     Stage,
@@ -22,6 +23,9 @@ from softfinger.daemon.simulation.physics.plant_state import (
 from softfinger.daemon.simulation.physics.tip import touch_object
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
+
+ELECTRIC_TIME = 1e-3  # lag of the servo current behind its reference [s]
+TABLE_SPEED = 0.0005  # speed below which table friction is viscous [m/s]
 
 
 @inner_kernel
@@ -34,7 +38,7 @@ def current_reference(plant: Plant, joint: int, q: float, rate: float) -> float:
     p, goals = plant.parameters, plant.goals
     if goals.torque_on[joint] == 0:
         return 0.0
-    limit = p.current_limit
+    limit = p.stall_current
     mode = goals.mode[joint]
     if mode == CURRENT_MODE:
         reference = goals.current[joint]
@@ -71,8 +75,8 @@ def set_motor_slopes(plant: Plant, g: float) -> None:
             if g * constant * (by_rate + g * by_q) < 0.1 * p.joint_inertia:
                 by_q = 0.0
                 by_rate = 0.0
-        plant.motor_by_q[joint] = constant * by_q / (p.electric_time + g)
-        plant.motor_by_rate[joint] = constant * by_rate / (p.electric_time + g)
+        plant.motor_by_q[joint] = constant * by_q / (ELECTRIC_TIME + g)
+        plant.motor_by_rate[joint] = constant * by_rate / (ELECTRIC_TIME + g)
 
 
 @inner_kernel
@@ -83,7 +87,7 @@ def joint_stiffness(plant: Plant, joint: int) -> float:
     q = plant.state.position[joint]
     ahead = q + p.step * plant.state.velocity[joint]
     if min(q, ahead) < p.stop_low[joint] or max(q, ahead) > p.stop_high[joint]:
-        stiffness += p.stop_stiffness
+        stiffness += STOP_STIFFNESS
     return stiffness
 
 
@@ -94,7 +98,7 @@ def free_object(plant: Plant, now: Motion) -> None:
     vx = now.velocity[2]
     vy = now.velocity[3]
     spin = now.velocity[4]
-    drag = p.table_force / math.sqrt(vx * vx + vy * vy + p.table_speed**2)
+    drag = p.table_force / math.sqrt(vx * vx + vy * vy + TABLE_SPEED**2)
     spin_drag = p.table_torque / math.sqrt(spin**2 + p.table_spin**2)
     plant.forces[2] = p.mass * p.gravity[0] + load[0] - drag * vx
     plant.forces[3] = p.mass * p.gravity[1] + load[1] - drag * vy
@@ -167,8 +171,8 @@ def free_joint(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
     plant.drag[finger] += p.joint_damping
     beyond = min(q - p.stop_low[finger], 0.0) + max(q - p.stop_high[finger], 0.0)
     if beyond != 0.0:
-        plant.drag[finger] += math.sqrt(p.stop_stiffness * p.joint_inertia)
-        torque -= p.stop_stiffness * beyond
+        plant.drag[finger] += math.sqrt(STOP_STIFFNESS * p.joint_inertia)
+        torque -= STOP_STIFFNESS * beyond
     return torque - float(plant.drag[finger] * now.velocity[finger])
 
 

@@ -11,6 +11,7 @@ from softfinger.daemon.simulation.physics.plant_state import DISC, Parameters, T
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 FACE = -1.0  # curvature radius that denotes a flat face
+RIM_STIFFNESS = 1e6  # stiffness of the backing plate against the object [N/m]
 _DISTANCE_MIN = 1e-12  # m
 
 
@@ -62,29 +63,27 @@ def nearest(p: Parameters, u: float, v: float) -> tuple[float, float, float, flo
 
 
 @inner_kernel
-def rim_on_plane(p: Parameters, tip: TipContact) -> float:
-    """Evaluate both ends of the rim on a plane and return the larger depth [m].
+def rim_on_plane(p: Parameters, tip: TipContact) -> None:
+    """Evaluate both ends of the rim on a plane, and set the rim depth to the larger depth.
 
-    The depths of the two ends are d − a(1 ∓ sin θ). The depth is negative if there is a gap. Each
-    end has its own spring, so energy and forces are smooth even if the plate lies flat on the face.
-    If the rim is in contact, this function sets the rim energy and its derivatives.
+    The depths of the two ends are d − a(1 ∓ sin θ). Each end has its own spring, so energy and
+    forces are smooth even if the plate lies flat on the face. If the rim is in contact, this
+    function sets the rim energy and its derivatives.
     """
     d = tip.d
     sine = tip.sine
     radius = p.radius
-    deepest: float = d - radius * (1.0 - abs(sine))
-    if deepest > 0.0:
+    tip.rim = d - radius * (1.0 - abs(sine))
+    if tip.rim > 0.0:
         right = max(d - radius * (1.0 - sine), 0.0)
         left = max(d - radius * (1.0 + sine), 0.0)
-        stiffness = p.rim_stiffness
-        tip.rim_energy = 0.5 * stiffness * (left * left + right * right)
-        tip.rim_d = stiffness * (left + right)
-        tip.rim_theta = stiffness * radius * tip.cosine * (right - left)
-    return deepest
+        tip.rim_energy = 0.5 * RIM_STIFFNESS * (left * left + right * right)
+        tip.rim_d = RIM_STIFFNESS * (left + right)
+        tip.rim_theta = RIM_STIFFNESS * radius * tip.cosine * (right - left)
 
 
 @inner_kernel
-def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
+def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> None:
     """Evaluate the rim on a disc as in :func:`rim_on_plane`, but with a single spring.
 
     ``away`` is the distance between the disc centre and the tip centre. The depth is the disc
@@ -94,13 +93,12 @@ def rim_on_disc(p: Parameters, tip: TipContact, away: float) -> float:
     up = away * tip.cosine
     beyond = max(abs(across) - p.radius, 0.0)
     clear = math.sqrt(up * up + beyond * beyond)
-    rim: float = p.roundness - clear
-    if rim > 0.0:
-        force = p.rim_stiffness * rim
+    tip.rim = p.roundness - clear
+    if tip.rim > 0.0:
+        force = RIM_STIFFNESS * tip.rim
         inverse = 1.0 / max(clear, _DISTANCE_MIN)
         outwards = beyond if across > 0.0 else -beyond
-        tip.rim_energy = 0.5 * force * rim
+        tip.rim_energy = 0.5 * force * tip.rim
         # ∂(away)/∂d = −1.
         tip.rim_d = force * inverse * (up * tip.cosine + outwards * tip.sine)
         tip.rim_theta = force * inverse * (up * across - outwards * up)
-    return rim

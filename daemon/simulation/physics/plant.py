@@ -29,6 +29,7 @@ from softfinger.daemon.simulation.physics.energy_guard import (
     shorten,
 )
 from softfinger.daemon.simulation.physics.forces import (
+    ELECTRIC_TIME,
     current_reference,
     evaluate_hand,
     evaluate_state,
@@ -44,7 +45,6 @@ from softfinger.daemon.simulation.physics.plant_state import (
     Motion,
     Plant,
     Sample,
-    TipContact,
 )
 from softfinger.daemon.simulation.physics.solver import (
     add_extra_shears,
@@ -76,9 +76,7 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
     i' = (r(q, ω) − i)/τ. Per unit of acceleration, the rate of the current decreases by (r_q g +
     r_ω) g/(τ + g). The step matrix contains this decrease.
     """
-    p = plant.parameters
-    lag = p.electric_time
-    constant = p.torque_constant
+    lag, constant = ELECTRIC_TIME, plant.parameters.torque_constant
     for j in range(2):
         reference = current_reference(plant, j, now.position[j], now.velocity[j])
         displacement = k.position[j]
@@ -226,33 +224,23 @@ def senses_other_tip(plant: Plant, finger: int) -> bool:
 
 
 @inner_kernel
-def sensed_contact_of(plant: Plant, finger: int) -> TipContact:
-    """Return the contact that the tip sensor measures."""
-    if senses_other_tip(plant, finger):
-        return plant.stages[0].on_tip[finger]
-    return plant.stages[0].on_object[finger]
-
-
-@inner_kernel
 def take_sample(plant: Plant, ring: Records[Sample]) -> None:
     """Interpolate between the previous and present contacts; write the sample to ``ring``."""
-    p = plant.parameters
+    p, stage = plant.parameters, plant.stages[0]
     due = plant.sample_count * p.sample_period
     back = min((plant.step_count * p.step - due) / p.step, 1.0)
     row = ring[plant.sample_count % len(ring)]
     row.number = plant.sample_count
-    row.t = due
     for finger in range(2):
-        now, before = sensed_contact_of(plant, finger), plant.sensed_contact[finger]
+        before = plant.sensed_contact[finger]
+        on_other_tip = senses_other_tip(plant, finger)
+        now = stage.on_tip[finger] if on_other_tip else stage.on_object[finger]
         # Do not interpolate between contacts with two different bodies.
-        same = senses_other_tip(plant, finger) == (plant.on_other_tip[finger] != 0)
-        fraction = back if same else 0.0
+        fraction = back if on_other_tip == (plant.on_other_tip[finger] != 0) else 0.0
         row.d[finger] = now.d - fraction * (now.d - before.d)
         row.theta[finger] = now.theta - fraction * (now.theta - before.theta)
         row.gain[finger] = now.gain - fraction * (now.gain - before.gain)
-        row.relaxation_factor[finger] = plant.relaxation_factor[finger]
-        if senses_other_tip(plant, finger):
-            row.relaxation_factor[finger] = 1.0
+        row.relaxation_factor[finger] = 1.0 if on_other_tip else plant.relaxation_factor[finger]
         row.curvature[finger] = now.curvature
         row.tangential[finger] = now.tangential - fraction * (now.tangential - before.tangential)
     plant.sample_count += 1
@@ -268,8 +256,10 @@ def settle(plant: Plant, ring: Records[Sample]) -> None:
         plant.state.shear[finger] = stage.on_object[finger].shear
         if plant.tips_may_touch:
             plant.state.extra_shear[CORNERS + finger] = stage.on_tip[finger].shear
-        plant.sensed_contact[finger] = sensed_contact_of(plant, finger)
-        plant.on_other_tip[finger] = 1 if senses_other_tip(plant, finger) else 0
+        on_other_tip = senses_other_tip(plant, finger)
+        now = stage.on_tip[finger] if on_other_tip else stage.on_object[finger]
+        plant.sensed_contact[finger] = now
+        plant.on_other_tip[finger] = on_other_tip
 
 
 # --- the steps -----------------------------------------------------------------------------------

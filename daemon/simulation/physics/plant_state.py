@@ -28,6 +28,7 @@ ALONG_D = 0
 ALONG_THETA = 1
 ALONG_SHEAR = 2
 
+STOP_STIFFNESS = 500.0  # stiffness of the joints' end stops [N·m/rad]
 LAYERS = 8  # number of footprint layers, which slip one after another from the edge inwards
 CORNERS = 8  # maximum number of corners of an object
 SHEARS = CORNERS + 2  # palm shear of each corner, then tip-to-tip shear of each tip
@@ -54,8 +55,7 @@ class Motion(Record):
 class Sample(Record):
     """Tip contacts at the time when a frame is sampled; see :class:`TipContact`."""
 
-    number: int  # -1 for an empty entry
-    t: float  # time since the start [s]
+    number: int  # sample k is taken k / tactile.rate after the start; -1 for an empty entry
     d: Pair
     theta: Pair
     gain: Pair
@@ -92,15 +92,11 @@ class Parameters(Record):
     tips_relax: bool
     relaxation: FloatTriple  # stiffness of each Prony term relative to the long-term stiffness
     relaxation_step: FloatTriple  # fraction of each Prony term that relaxes per sub-step
-    rim_stiffness: float  # [N/m]
-    tolerance: float  # relative energy gain allowed in smooth steps
     half_separation: float  # half the distance between the pivots [m]
     length: float  # finger length [m]
     offset: float  # tip offset from the finger axis [m]
     finger_present: Flags  # True if the finger is in the scene
     shape: int  # object shape
-    half_width: float  # [m]
-    half_height: float  # [m]
     roundness: float  # radius of a disc [m]
     factor: float  # stiffness of a tip on the object relative to its stiffness on a plane
     extent: float  # maximum distance from the object centre to the outline [m]
@@ -111,7 +107,6 @@ class Parameters(Record):
     gravity: Pair  # x, y [m/s²]
     table_force: float  # Coulomb friction between table and object [N]
     table_torque: float  # Coulomb friction torque between table and object [N·m]
-    table_speed: float  # speed below which table friction is viscous [m/s]
     table_spin: float  # angular speed below which table friction is viscous [rad/s]
     palm: float  # y coordinate of the palm [m]
     palm_friction: float
@@ -123,15 +118,12 @@ class Parameters(Record):
     stribeck_speed: float  # speed at which the additional friction has decreased to 1/e [rad/s]
     presliding: float  # bristle deflection at which the gears slip [rad]
     torque_constant: float  # [N·m/A]
-    electric_time: float  # time constant of the current [s]
-    current_limit: float  # [A]
     stall_current: float  # [A]
     no_load_speed: float  # [rad/s]
     position_gain: float  # [A/rad]
     rate_gain: float  # [A·s/rad]
     stop_low: Pair  # end stops [rad]
     stop_high: Pair
-    stop_stiffness: float  # [N·m/rad]
     joints_held: bool
     object_held: bool
     script_speed: float  # speed at which a held object moves back and forth [m/s]
@@ -198,7 +190,7 @@ class TipContact(Record):
     energy: float  # elastic energy [J]
     normal: float  # N [N]
     tangential: float  # T [N]
-    rim: float  # rim penetration depth, or 0 without contact [m]
+    rim: float  # rim penetration depth, negative for a gap [m]
     rim_energy: float  # rim energy [J], valid only if ``rim`` is above 0
     rim_d: float  # derivatives of the rim energy with respect to d [N] and θ [N·m]
     rim_theta: float
@@ -224,13 +216,6 @@ class ExtraRow(Record):
     stiffness: float
     damping: float
     shear: int  # 1 + index of the row's extra shear, or 0 without an extra shear
-
-
-class Factors(Record):
-    """Factorisation L D Lᵀ of the step matrix."""
-
-    inverse: FloatFive  # inverse pivots
-    lower: Annotated[FloatArray, 5, 5]
 
 
 class Plant(Record):
@@ -269,4 +254,5 @@ class Plant(Record):
     tips_may_touch: bool  # True if the tip-to-tip contact was evaluated
     has_extra_rows: bool  # True if extra rows may be active in this step
     extra: Annotated[Records[ExtraRow], EXTRA_ROWS]
-    factors: Factors
+    # Factorisation L D Lᵀ of the step matrix: L below the diagonal, and D⁻¹ on the diagonal.
+    factors: Annotated[FloatArray, 5, 5]

@@ -11,12 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from softfinger.daemon.backends import backend
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.simulation_settings import SimulationSettings
-from softfinger.daemon.simulation.physics.plant_state import (
-    CORNERS,
-    DISC,
-    NO_OBJECT,
-    POLYGON,
-)
+from softfinger.daemon.simulation.physics.plant_state import CORNERS, DISC, NO_OBJECT, POLYGON
 
 __all__ = ["Shape", "polygon"]
 

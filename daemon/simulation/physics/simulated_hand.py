@@ -29,13 +29,8 @@ from softfinger.daemon.simulation.faults import (
     MeasurementFaults,
 )
 from softfinger.daemon.simulation.physics import plant
-from softfinger.daemon.simulation.physics.energy_guard import LOSSLESS_TOLERANCE
-from softfinger.daemon.simulation.physics.plant_state import (
-    NO_OBJECT,
-    Parameters,
-    Plant,
-    Sample,
-)
+from softfinger.daemon.simulation.physics.forces import TABLE_SPEED
+from softfinger.daemon.simulation.physics.plant_state import NO_OBJECT, Parameters, Plant, Sample
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import FINGERS
@@ -51,12 +46,8 @@ STANDARD_GRAVITY = 9.80665  # m/s²
 STEP_MAX = 0.25e-3  # s
 STEP_MIN = 0.05e-3  # s
 PHASE_MAX = 0.25  # maximum phase advance of the fastest oscillation per sub-step [rad]
-ELECTRIC_TIME = 1e-3  # lag of the servo current behind its reference [s]
 FULL_EFFORT_ERROR = 0.27  # error at which the position loop commands the stall current [rad]
-TABLE_SPEED = 0.0005  # speed below which table friction is viscous [m/s]
 STOP_CLEARANCE = 0.05  # distance from the commanded range to the mechanical end stops [rad]
-STOP_STIFFNESS = 500.0  # N·m/rad
-RIM_STIFFNESS = 1e6  # stiffness of the backing plate against the object [N/m]
 COMPRESSION_DEPTH = 0.4  # depth of the scripted compression as a fraction of the tip radius
 
 
@@ -107,8 +98,6 @@ def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step:
     p.tips_relax = any(simulation.tip_relaxation)
     p.relaxation[:] = simulation.tip_relaxation
     p.relaxation_step[:] = [-math.expm1(-step / each) for each in simulation.tip_relaxation_times]
-    p.rim_stiffness = RIM_STIFFNESS
-    p.tolerance = LOSSLESS_TOLERANCE if simulation.tip_loss == 0.0 else 0.0
     p.half_separation = 0.5 * settings.hand.pivot_separation
     p.length = settings.hand.finger_length
     p.offset = settings.hand.finger_offset
@@ -124,8 +113,6 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.palm = simulation.palm
     p.palm_friction = simulation.palm_friction
     p.shape = shape.kind
-    p.half_width = 0.5 * simulation.object_width
-    p.half_height = 0.5 * simulation.object_height
     p.roundness = shape.roundness
     p.extent = shape.extent
     p.corners = len(shape.corners)
@@ -144,7 +131,6 @@ def _object(p: Parameters, settings: Settings) -> None:
     pressing = math.sqrt(max(STANDARD_GRAVITY**2 - math.hypot(*simulation.gravity) ** 2, 0.0))
     p.table_force = simulation.table_friction * mass * pressing
     p.table_torque = p.table_force * shape.mean_radius
-    p.table_speed = TABLE_SPEED
     p.table_spin = TABLE_SPEED / shape.mean_radius
     # A single finger cannot hold an object, so a one-finger scene fixes the object to the test
     # bench.
@@ -167,8 +153,6 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.stribeck_speed = simulation.joint_stribeck_speed
     p.presliding = simulation.joint_presliding
     p.torque_constant = constant
-    p.electric_time = ELECTRIC_TIME
-    p.current_limit = model.stall_current
     p.stall_current = model.stall_current
     p.no_load_speed = model.no_load_speed / servos.gear_ratio
     p.position_gain = model.stall_current / FULL_EFFORT_ERROR
@@ -176,7 +160,6 @@ def _joints(p: Parameters, settings: Settings) -> None:
     p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
     p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
     p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
-    p.stop_stiffness = STOP_STIFFNESS
     p.joints_held = servos.backend == "none"
 
 
@@ -246,9 +229,8 @@ class SimulatedHand:
         self.plant.relaxation_factor[:] = 1.0 + sum(settings.simulation.tip_relaxation)
         state, simulation = self.plant.state, settings.simulation
         state.position[:2] = settings.hand.open_angle
-        state.position[2:4] = simulation.object_position
-        state.position[4] = simulation.object_angle
-        self._first_pose = state.position[2:].copy()
+        self._first_pose = *simulation.object_position, simulation.object_angle
+        state.position[2:] = self._first_pose
         goals = self.plant.goals
         goals.mode[:] = CURRENT_BASED_POSITION_MODE
         goals.stiffness[:] = goals.duty[:] = 1.0
@@ -258,7 +240,6 @@ class SimulatedHand:
         self._ring = np.zeros(stored, Sample.dtype)
         self._ring["number"] = -1
         self._rows = [Sample(self._ring[k : k + 1]) for k in range(stored)]
-        self._done = 0
         self._torque_until = math.inf
         self._per_step = 1.0 / self.step
         self.q = state.position[:2]  # rad
@@ -273,9 +254,6 @@ class SimulatedHand:
         self.normal = felt.array["normal"]  # N [N]
         self.tangential = felt.array["tangential"]  # T [N]
         self.shear = state.shear  # d_t [m]
-        # Depth to which the backing plate's rim penetrates the object. A depth above 0 means that
-        # the tip is compressed beyond its limit.
-        self.rim = felt.array["rim"]  # m
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on
         self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
@@ -288,7 +266,7 @@ class SimulatedHand:
     @property
     def t(self) -> float:
         """Time of the state [s]."""
-        return self.start + self._done * self.step
+        return self.start + self.plant.step_count * self.step
 
     def advance(self, t: float) -> None:
         """Advance to the last sub-step at or before ``t`` [s], but never go back in time."""
@@ -300,7 +278,7 @@ class SimulatedHand:
 
     def _advance(self, t: float) -> None:
         # Adding 1e-6 prevents rounding down if t is a multiple of the sub-step.
-        remaining = int((t - self.start) * self._per_step + 1e-6) - self._done
+        remaining = int((t - self.start) * self._per_step + 1e-6) - self.plant.step_count
         steps_max = int(ADVANCE_MAX * self._per_step)
         while remaining > 0:
             count = min(remaining, steps_max)
@@ -378,11 +356,6 @@ class SimulatedHand:
             return False
         return True
 
-    @property
-    def sample_count(self) -> int:
-        """Number of contact samples taken; sample k is taken at ``start`` + k / tactile.rate."""
-        return self.plant.sample_count
-
     def sample(self, number: int) -> Sample:
         """Return sample ``number``, which is valid until a newer sample replaces it.
 
@@ -391,8 +364,8 @@ class SimulatedHand:
         row = self._rows[number % len(self._rows)]
         if row.number != number:
             raise LookupError(
-                f"sample {number} is not stored; {self.sample_count} samples have been taken, and "
-                f"the latest {len(self._rows)} are stored"
+                f"sample {number} is not stored; {self.plant.sample_count} samples have been "
+                f"taken, and the latest {len(self._rows)} are stored"
             )
         return row
 
@@ -402,4 +375,3 @@ class SimulatedHand:
 
     def _run(self, count: int) -> None:
         plant.step(self.plant.array, self.table.data, self._ring, count)
-        self._done += count

@@ -64,7 +64,7 @@ def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
 def factorise(plant: Plant, g: float) -> None:
     """Factorise the first-stage matrix M + gD + g²K for the five coordinates."""
     p = plant.parameters
-    full = plant.factors.lower
+    full = plant.factors
     for i in range(5):
         for j in range(5):
             full[i, j] = 0.0
@@ -93,34 +93,32 @@ def factorise(plant: Plant, g: float) -> None:
             by = weight * extra.row[i]
             for j in range(5):
                 full[i, j] += by * extra.row[j]
-    inverse = plant.factors.inverse
     for k in range(5):
         if p.joints_held if k < 2 else p.object_held:
             for j in range(5):
                 full[k, j] = 0.0
                 full[j, k] = 0.0
-            inverse[k] = 0.0
             continue
         pivot = full[k, k]
-        inverse[k] = 1.0 / pivot
         for i in range(k + 1, 5):
             ratio = full[i, k] / pivot
             for j in range(k + 1, 5):
                 full[i, j] -= ratio * full[k, j]
             full[i, k] = ratio
+        full[k, k] = 1.0 / pivot
 
 
 @inner_kernel
 def solve(plant: Plant, k: Motion) -> None:
     """Solve the step equations for the velocities in ``k``, which are 0 for fixed bodies."""
-    full, out = plant.factors.lower, k.velocity
+    full, out = plant.factors, k.velocity
     for i in range(5):
         value = plant.load[i]
         for j in range(i):
             value -= full[i, j] * out[j]
         out[i] = value
     for i in range(5):
-        out[i] *= plant.factors.inverse[i]
+        out[i] *= full[i, i]
     for i in range(4, -1, -1):
         for j in range(i + 1, 5):
             out[i] -= full[j, i] * out[j]

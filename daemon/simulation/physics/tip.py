@@ -59,7 +59,12 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics.outline import nearest, rim_on_disc, rim_on_plane
+from softfinger.daemon.simulation.physics.outline import (
+    RIM_STIFFNESS,
+    nearest,
+    rim_on_disc,
+    rim_on_plane,
+)
 from softfinger.daemon.simulation.physics.plant_state import (
     ALONG_D,
     ALONG_SHEAR,
@@ -288,6 +293,12 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     tip.stiffness[ALONG_D] = stiffness_d + ahead
     tip.stiffness[ALONG_THETA] = stiffness_theta
     tip.stiffness[ALONG_SHEAR] = stiffness_t
+    if tip.rim + tip.travel > 0.0:
+        # The rim may touch the object in this step. The gradient of the rim depth is at most the
+        # gradient of d plus the radius times the gradient of θ. Therefore, doubling the rim
+        # stiffness along d and θ gives an upper bound.
+        tip.stiffness[ALONG_D] += 2.0 * RIM_STIFFNESS
+        tip.stiffness[ALONG_THETA] += 2.0 * RIM_STIFFNESS * p.radius**2
     tip.damping[ALONG_D] = loss_d + loss * ahead
     tip.damping[ALONG_THETA] = loss_theta
     tip.damping[ALONG_SHEAR] = loss_t
@@ -303,18 +314,6 @@ def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: flo
     tip.rows[r, 1] = x
     tip.rows[r, 2] = y
     tip.rows[r, 3] = rotation
-
-
-@inner_kernel
-def stiffen_by_rim(p: Parameters, tip: TipContact) -> None:
-    """Add the rim stiffness to a tip whose rim may touch the object in this step.
-
-    The gradient of the rim depth is at most the gradient of d plus the radius times the gradient of
-    θ. Therefore, doubling the stiffness along d and θ gives an upper bound.
-    """
-    hard = 2.0 * p.rim_stiffness
-    tip.stiffness[ALONG_D] += hard
-    tip.stiffness[ALONG_THETA] += hard * p.radius**2
 
 
 @inner_kernel
@@ -378,11 +377,10 @@ def touch_object(
         theta_rotation = (rotation_t + curved) * inverse
     if curved > 0.0:
         tip.curvature = 1.0 / curved
-        rim = rim_on_disc(p, tip, distance + curved)
+        rim_on_disc(p, tip, distance + curved)
     else:
         tip.curvature = 0.0
-        rim = rim_on_plane(p, tip)
-    tip.rim = max(rim, 0.0)
+        rim_on_plane(p, tip)
     tip.travel = travel
     tip.rate_d = rate_d
     tip.rate_theta = (
@@ -394,8 +392,6 @@ def touch_object(
     tip.shear = now.shear[finger]
     tip.shear_variance = plant.shear_variance[finger]
     contact_forces(p, table, tip, p.factor * plant.relaxation_factor[finger])
-    if rim + travel > 0.0:
-        stiffen_by_rim(p, tip)
     tangent = tip.tangent
     t_q -= tangent * v_m
     t_x = -my + tangent * mx

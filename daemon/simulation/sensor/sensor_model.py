@@ -59,16 +59,13 @@ class SensorModel:
         dead: Sequence[tuple[int, int]] = (),
     ) -> None:
         self.grid = grid
-        self._flaws = flaws
-        self._per_count = board.pascal_per_count
+        self._board, self._flaws = board, flaws
         self._material, self._cells = material, grid.on(tip)
-        self._ends = (board.threshold, board.full_count)
         self._generator = np.random.Generator(np.random.SFC64(seed))
         shape = grid.shape
         deviations = self._generator.standard_normal(shape)
-        sensitivity = (
-            gain * np.maximum(1.0 + flaws.tactile_gain_spread * deviations, 0.0) / self._per_count
-        )
+        spread = np.maximum(1.0 + flaws.tactile_gain_spread * deviations, 0.0)
+        sensitivity = gain * spread / board.pascal_per_count
         for row, col in dead:
             sensitivity[row, col] = 0.0
         if flaws.tactile_dead > 0.0:
@@ -88,10 +85,6 @@ class SensorModel:
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
         self._warmer = np.zeros(1)  # relative gain drift
-        self._full_scale = board.full_count * board.pascal_per_count
-        self._signal = np.zeros(shape)  # counts
-        self._normals = np.zeros(shape)
-        self._lines = (np.zeros(shape[0]), np.zeros(shape[1]))
         self._t: float | None = None
 
     @property
@@ -164,9 +157,9 @@ class SensorModel:
         if flaws.tactile_response > 0.0:
             pressure[:] = lag(pressure, flaws.tactile_response, elapsed, self._response_lag)
         if flaws.tactile_drift > 0.0:
-            self._generator.standard_normal(out=self._normals)
-            deviation = flaws.tactile_drift / self._per_count
-            drift(self._offset, deviation, flaws.tactile_drift_time, elapsed, self._normals)
+            normals = self._generator.standard_normal(self.grid.shape)
+            deviation = flaws.tactile_drift / self._board.pascal_per_count
+            drift(self._offset, deviation, flaws.tactile_drift_time, elapsed, normals)
         if flaws.tactile_gain_drift > 0.0:
             normal = self._generator.standard_normal(1)
             drift(self._warmer, flaws.tactile_gain_drift, flaws.tactile_drift_time, elapsed, normal)
@@ -222,29 +215,32 @@ class SensorModel:
         self, out: NDArray[np.uint16], faults: MeasurementFaults | None = None, t: float = 0.0
     ) -> None:
         """Apply the ``faults`` active at ``t`` [s], and write the cell counts to ``out``."""
-        flaws = self._flaws
+        flaws, board = self._flaws, self._board
         felt = self._pressure
         if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
-            felt = curve(felt, flaws.tactile_exponent, self._full_scale, flaws.tactile_fold)
-        np.multiply(felt, self._sensitivity, out=self._signal)
+            full_scale = board.full_count * board.pascal_per_count
+            felt = curve(felt, flaws.tactile_exponent, full_scale, flaws.tactile_fold)
+        signal = felt * self._sensitivity  # counts
         if flaws.tactile_gain_drift > 0.0:
-            self._signal *= np.maximum(1.0 + self._warmer, 0.0)
+            signal *= np.maximum(1.0 + self._warmer, 0.0)
         if faults is not None:
-            faults.apply(self._signal, self._ends[1], t)
+            faults.apply(signal, board.full_count, t)
+        rows, cols = np.zeros((self.grid.rows, 1)), np.zeros(self.grid.cols)
         if flaws.tactile_crosstalk > 0.0:
-            crosstalk(self._signal, flaws.tactile_crosstalk, *self._lines)
+            # The cells of a resistive matrix share drive lines and sense lines, and current leaks
+            # along these lines.
+            rows += flaws.tactile_crosstalk * signal.mean(axis=1, keepdims=True)
+            cols += flaws.tactile_crosstalk * signal.mean(axis=0)
         if flaws.tactile_row_noise > 0.0:
-            rows = self._lines[0]
-            if not flaws.tactile_crosstalk > 0.0:
-                rows[:] = 0.0
-            rows += self._generator.normal(
-                0.0, flaws.tactile_row_noise / self._per_count, rows.shape
-            )
+            deviation = flaws.tactile_row_noise / board.pascal_per_count
+            rows += self._generator.normal(0.0, deviation, rows.shape)
+        signal += self._offset
+        signal += rows
+        signal += cols
         if flaws.tactile_noise > 0.0:
-            self._generator.standard_normal(out=self._normals)
-        signal = self._signal + self._offset + self._lines[0][:, None] + self._lines[1]
-        signal += flaws.tactile_noise / self._per_count * self._normals
-        count(signal, self._sensitivity > 0.0, self._ends, out)
+            deviation = flaws.tactile_noise / board.pascal_per_count
+            signal += deviation * self._generator.standard_normal(signal.shape)
+        count(signal, self.active, (board.threshold, board.full_count), out)
 
 
 # --- effects of a soft, resistive sensor ---------------------------------------------------------
@@ -311,16 +307,6 @@ def drift(
     decay = math.exp(-elapsed / time)
     value *= decay
     value += deviation * math.sqrt(1.0 - decay * decay) * normals
-
-
-def crosstalk(signal: FloatArray, fraction: float, rows: FloatArray, cols: FloatArray) -> None:
-    """Compute the crosstalk of each line as a ``fraction`` of the line's mean signal.
-
-    The cells of a resistive matrix share drive lines and sense lines, and current leaks along these
-    lines. The results are written to ``rows`` [rows] and ``cols`` [cols].
-    """
-    np.multiply(fraction, signal.mean(axis=1), out=rows)
-    np.multiply(fraction, signal.mean(axis=0), out=cols)
 
 
 def count(

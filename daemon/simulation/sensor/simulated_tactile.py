@@ -73,7 +73,6 @@ class SimulatedTactile:
             simulation.tactile_jitter,
             (simulation.seed, finger, 1),
         )
-        self._shape = (tactile.rows, tactile.cols)
         self._model = make_sensor_model(hand.settings, finger)
         self._radius = hand.settings.tip.radius
         self._solid = hand.settings.tip.physics == "solid"
@@ -112,10 +111,10 @@ class SimulatedTactile:
 
         ``resyncs`` and ``skipped_bytes`` are always 0.
         """
-        arrivals = self._arrivals
+        missed = self._arrivals.missed + self._lost
         return {
-            "frames": arrivals.arrived - self._lost,
-            "missed": arrivals.missed + self._lost,
+            "frames": self._arrivals.number + 1 - missed,
+            "missed": missed,
             "resyncs": 0,
             "skipped_bytes": 0,
         }
@@ -145,7 +144,7 @@ class SimulatedTactile:
         last = round(self._faults("replay", t) / self._period)
         if last == 0 or not self._given:
             self._replayed = None
-            data: NDArray[np.uint16] = np.empty(self._shape, dtype=np.uint16)
+            data: NDArray[np.uint16] = np.empty(self._model.grid.shape, dtype=np.uint16)
             self._model.read(data, self._faults, t)
             return data
         if self._replayed is None:
@@ -220,7 +219,6 @@ class Arrivals:
         self._random = np.random.default_rng(seed)
         self.number = -1  # number of the newest frame
         self.arrival = start  # arrival time of the newest frame [s]
-        self.arrived = 0  # number of frames that have arrived
         self.missed = 0  # number of frames lost before the newest frame
         self._next = -1
         self.next_arrival = start + delay  # arrival time of the next frame [s]
@@ -233,7 +231,6 @@ class Arrivals:
             self.missed += self._next - self.number - 1
             self.number = self._next
             self.arrival = self.next_arrival
-            self.arrived += 1
             self._plan()
         return self.number > newest
 
