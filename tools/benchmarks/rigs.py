@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import random
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -24,7 +23,6 @@ from softfinger.daemon.types import Frame, Goal, Reading
 
 Sections = Mapping[str, Mapping[str, Any]]
 
-HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 SOLID: Sections = {  # tips of solid rubber
     "tip": {"physics": "solid"},
     "material": {"law": "constant", "modulus": 0.15e6},
@@ -33,7 +31,6 @@ SOLID: Sections = {  # tips of solid rubber
 SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor adds only noise
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
-SOFTFINGER = (sys.executable, "-m", "softfinger")
 _FRAME_COUNT = 16  # number of frames that are stored for each canned sensor
 
 

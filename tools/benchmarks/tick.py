@@ -25,7 +25,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, attempt, figure, timed
-from softfinger.tools.benchmarks.rigs import HIL, can, hold, must_hold, virtual_daemon
+from softfinger.tools.benchmarks.rigs import can, hold, must_hold, virtual_daemon
 from softfinger.tools.processes.emulate import emulator_process
 
 _PRIORITY = 40  # SCHED_FIFO priority
@@ -128,8 +128,8 @@ def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) 
     back_to_back: list[float] = []
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        stack.enter_context(emulator_process("--dir", folder, "--config", HIL, "--baud", baud))
-        daemon = stack.enter_context(Daemon(load(HIL, folder, changes), wire=False))
+        stack.enter_context(emulator_process("--dir", folder, "--config", "hil", "--baud", baud))
+        daemon = stack.enter_context(Daemon(load(Path("hil"), folder, changes), wire=False))
         stack.enter_context(RealTime(daemon.settings))
         loop, clock, state = daemon.loop, daemon.clock, daemon.loop.state
         hold(daemon)
