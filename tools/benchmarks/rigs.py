@@ -19,7 +19,7 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame, Goal, Reading
+from softfinger.daemon.types import Frame, Goal, Reading, State
 
 Sections = Mapping[str, Mapping[str, Any]]
 
@@ -40,8 +40,7 @@ class RigError(SoftfingerError):
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
     """Return ``base`` updated with ``sections``."""
-    names = dict.fromkeys((*base, *sections))
-    return {name: {**base.get(name, {}), **sections.get(name, {})} for name in names}
+    return {k: {**base.get(k, {}), **sections.get(k, {})} for k in {**base, **sections}}
 
 
 @contextlib.contextmanager
@@ -77,12 +76,11 @@ def hold(daemon: Daemon) -> None:
         loop.advance(1.0)
         if loop.state.mode == "holding":
             break
-    must_hold(daemon)
+    must_hold(loop.state)
 
 
-def must_hold(daemon: Daemon) -> None:
+def must_hold(state: State) -> None:
     """Raise RigError unless the hand is holding an object."""
-    state = daemon.loop.state
     if state.mode != "holding":
         raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
 

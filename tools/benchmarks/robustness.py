@@ -197,11 +197,8 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
         hand.command("arm")
         loop.advance(0.1 + chance.uniform(0.0, 0.02))
         watch, begin = Watch(case.force, _EXCESS_RATIO), state.t
-        loaded = False
 
         def look() -> None:
-            if loaded:
-                return
             forces = hand.plant.force.tolist()
             watch.see(state.t, forces, hand.plant.object_pose[:2].tolist(), state.torque)
             found.raised = found.raised or state.goal.force > 1.02 * case.force
@@ -223,7 +220,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
         found.peak, found.above = watch.peak, watch.above
         found.first_off = watch.first_off(_ERROR_MAX)
         if case.load and gripped and hand.between():
-            loaded = True
+            hand.look = lambda: None  # Observe only the grip without the load.
             for k in range(_STEPS := 20):
                 hand.plant.load(push=case.load * (k + 1) / _STEPS)
                 loop.advance(case.within / _STEPS)
@@ -250,12 +247,9 @@ def measure(
 ) -> list[Report]:
     """Return a table for the rows and a table for the ensemble; ``brief`` runs only a few cases."""
     trials = trials or (1 if brief else _TRIAL_COUNT)
-    hands = [
-        drawn(seed) for seed in range(1, (4 if brief else trials * _HAND_COUNT // _TRIAL_COUNT) + 1)
-    ]
+    count = 4 if brief else trials * _HAND_COUNT // _TRIAL_COUNT
+    hands = [case for case in map(drawn, range(1, count + 1)) if only in case.name]
     rows = [case for case in ROWS if only in case.name]
-    if only:
-        hands = [case for case in hands if only in case.name]
     seeds = range(1, trials + 1)
     jobs = [(case, seed) for case in rows for seed in seeds] + [(hand, 1) for hand in hands]
     outcomes = (Outcome(**each) for each in sweep(_outcome, jobs))

@@ -55,7 +55,7 @@ def _simulated(title: str, seconds: int) -> Report:
             figure("a second on virtual time", "ms", 1e-3 * np.array(second), 50.0),
             figure("a tick", "µs", ticks(daemon, 2_000)),
         ]
-        must_hold(daemon)
+        must_hold(daemon.loop.state)
     return Report(title, rows)
 
 
@@ -83,8 +83,8 @@ def _in_turns(title: str, rounds: int) -> Report:
                     samples.setdefault(name, []).extend(turn())
                     share = (time.thread_time() - before) / (time.perf_counter() - began)
                     used[name] = used.get(name, 0.0) + share / rounds
-        must_hold(quiet)
-        must_hold(heard)
+        must_hold(quiet.loop.state)
+        must_hold(heard.loop.state)
     rows = [
         figure(name, "µs", found, None if "place" in name else 20.0)
         for name, found in samples.items()
@@ -147,7 +147,7 @@ def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) 
                 clock.sleep_until(deadline)
                 in_place += timed(lambda: loop.tick(clock.now()))
             back_to_back += timed(cycle, _IN_TURN)
-        must_hold(daemon)
+        must_hold(daemon.loop.state)
         loop.command({"command": "stop"})
         loop.tick(clock.now())
     base = float(np.median(back_to_back))

@@ -175,8 +175,7 @@ class Terms(NamedTuple):
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
         """Return U(d, 0) [J] from eq. 12."""
-        first, second, third = self.terms(radius, modulus, d)
-        return first + second + third
+        return np.sum(self.terms(radius, modulus, d), axis=0)
 
     def terms(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
         """Return each term's contribution [J] to the energy in eq. 12."""

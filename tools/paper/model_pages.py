@@ -234,8 +234,8 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
         }
         row = {
             "theta [deg]": tilt,
-            "fitted exponent of d [1]": _power(d, integral),
-            "fitted exponent of d, Table I's law [1]": _power(d, value),
+            "fitted exponent of d [1]": exponent(d[_FITTED], integral[_FITTED]),
+            "fitted exponent of d, Table I's law [1]": exponent(d[_FITTED], value[_FITTED]),
             "fitted factor [1]": integral[-1] / power[-1],
             f"factor {quantity.prefactor} [1]": math.cos(math.radians(tilt))
             ** (1 - quantity.exponent),
@@ -244,9 +244,9 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     return Sheet(name, columns), summary(f"{name}_exponents", rows)
 
 
-def _power(d: FloatArray, values: FloatArray) -> float:
-    """Fit a power law to ``values`` for d from 1 to 8 mm, and return its exponent."""
-    return float(np.polyfit(np.log(d[_FITTED]), np.log(values[_FITTED]), 1)[0])
+def exponent(d: FloatArray, values: FloatArray) -> float:
+    """Return ζ from a least-squares fit of ln ``values`` = ln C + ζ ln ``d``."""
+    return float(np.polyfit(np.log(d), np.log(values), 1)[0])
 
 
 def _key(axes: Axes, quantity: Plotted) -> None:
