@@ -19,11 +19,10 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.types import Contact
 from softfinger.tools.benchmarks.rigs import Sections, merged
-from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TILTS
+from softfinger.tools.paper.model_pages import DEPTHS, FORCE, MILLI, MODULUS, TILTS
 from softfinger.tools.paper.sheets import (
     DEPTH,
     DOT,
-    FORCE,
     RELATIVE,
     FigurePage,
     FloatArray,
@@ -340,7 +339,7 @@ PAGES = {
         (7.6, 6.2),
         compression,
         (
-            Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.2), (0, 78), "upper left"),
+            Panel(_forces, DEPTH, FORCE.axis, "(a) force", (0, 8.2), (0, 78), "upper left"),
             _error_panel("F", "(b) force error", "estimate over model − 1 [%]", 5.0),
             _error_panel("d", "(c) displacement error", "estimate − truth [µm]", 75.0),
             _error_panel("theta", "(d) angle error", "estimate − truth [deg]", 0.5),
@@ -358,7 +357,7 @@ PAGES = {
         (7.6, 6.2),
         tilt_and_roll,
         (
-            Panel(partial(_along, "F"), RELATIVE, FORCE, "(a) force along the path", _PATH),
+            Panel(partial(_along, "F"), RELATIVE, FORCE.axis, "(a) force along the path", _PATH),
             Panel(partial(_along, "U"), RELATIVE, "elastic energy U [mJ]",
                   "(b) energy along the path", _PATH, None, "lower right"),
             Panel(_over_upright, RELATIVE, "U(θ)/U(0)", "(c) energy while rolling, over U(0)",

@@ -23,7 +23,6 @@ Columns = Mapping[str, Any]
 Ends = tuple[float, float]
 
 DEPTH = "displacement d [mm]"
-FORCE = "total elastic force F [N]"
 RELATIVE = "relative angle θ [deg]"
 CIRCLE: dict[str, Any] = {"marker": "o", "linestyle": "none", "mfc": "none"}
 DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
