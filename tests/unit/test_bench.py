@@ -2,7 +2,6 @@
 
 import json
 import math
-import random
 from dataclasses import replace
 from functools import partial
 from timeit import Timer
@@ -11,29 +10,11 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
-from softfinger.tools.benchmarks import (
-    bench,
-    control,
-    estimator,
-    faults,
-    measuring,
-    reflex,
-    tick,
-)
-from softfinger.tools.benchmarks.faults import (
-    BOUNDED,
-    SETTLES,
-    FaultCase,
-    GripTrial,
-    measure,
-)
-from softfinger.tools.benchmarks.measuring import (
-    Report,
-    figure,
-    interleave,
-)
+from softfinger.tools.benchmarks import bench, control, estimator, faults, measuring, reflex, tick
+from softfinger.tools.benchmarks.faults import BOUNDED, SETTLES, FaultCase, GripTrial, measure
+from softfinger.tools.benchmarks.measuring import Report, figure, interleave
 from softfinger.tools.benchmarks.rigs import RigError
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
+from softfinger.tools.benchmarks.virtual_grip import Watch
 
 
 def test_interleaved_timing(monkeypatch):
@@ -194,15 +175,6 @@ def test_a_held_load_slides_and_a_lost_load_is_reported():
     lost = reflex.overloaded(weak, 0.0, 18.0, 1)
     assert lost.lost
     assert 0.0 <= lost.said < 1.0
-
-
-def holding(force: float = 8.0) -> VirtualGrip:
-    grip = VirtualGrip.drawn(1, random.Random(1), {})
-    grip.command("arm")
-    grip.loop.advance(0.1)
-    grip.command("grasp", force=force)
-    assert grip.until("holding", 3.0)
-    return grip
 
 
 @pytest.mark.extended

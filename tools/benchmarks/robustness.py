@@ -27,8 +27,7 @@ from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch, diagnos
 _TRIAL_COUNT, _HAND_COUNT = 20, 400
 # Time limit for reaching the mode `holding`, undisturbed holding time, and observation time [s].
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
-# Two limits for the relative force error, and one for the displacement [m].
-_ERROR_MAX, _ERROR_FAR, _SLIDE_MAX = 0.2, 0.3, 0.01
+_ERROR_MAX, _ERROR_FAR = 0.2, 0.3  # limits for the relative force error
 _REPORT_TIME_MAX = 2.0  # time limit for reporting a force error above `_ERROR_MAX` [s]
 # Limits before a load is applied: ratio of force to requested force, and time above it [s].
 _EXCESS_RATIO, _EXCESS_TIME_MAX = 1.4, 0.1
