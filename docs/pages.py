@@ -349,7 +349,7 @@ def checkpoints() -> str:
 
     rows = []
     for d, theta in ((2, 0), (2, 30), (4, 0), (4, 15), (6, 30), (8, 0), (8, 30)):
-        c = closed_forms(0.304e6, 1e-3 * d, math.radians(theta))
+        c = closed_forms(_MODULUS, 1e-3 * d, math.radians(theta))
         values = c.force, 1e3 * c.energy, c.energy_d, 1e3 * c.energy_theta
         rows.append([str(d), str(theta), *(f"{float(each):.12g}" for each in values)])
     return _table(("d [mm]", "θ [°]", "F [N]", "U [mJ]", "∂U/∂d [N]", "∂U/∂θ [mN·m]"), rows)
@@ -400,17 +400,23 @@ def early_minimum() -> str:
     return _table(("d [mm]", *heads, "U, 5 %, simulated tip"), rows)
 
 
-def upright_forces() -> str:
-    """Tabulate the force on upright tips for several contact laws."""
+_RADIUS, _MODULUS = 0.020, 0.304e6  # tip radius [m] and modulus [Pa] on the pages
+
+
+def _contact_table(*law: Any) -> Any:
+    """Build the contact table of a tip with the given contact law and a constant modulus."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
 
-    radius, modulus = 0.020, 0.304e6
+    return ContactTable.build(Fingertip(_RADIUS, *law), Material.constant(_MODULUS))
+
+
+def upright_forces() -> str:
+    """Tabulate the force on upright tips for several contact laws."""
 
     def force(d: float, *law: Any) -> float:
-        table = ContactTable.build(Fingertip(radius, *law), Material.constant(modulus))
-        return float(table(d, 0.0).force)
+        return float(_contact_table(*law)(d, 0.0).force)
 
     rows = []
     for d in (0.001, 0.002, 0.004, 0.006):
@@ -418,7 +424,7 @@ def upright_forces() -> str:
             f"{force(d, 'solid', 0.49, base):.3g} ({force(d, 'solid', 0.49, base, 'sticking'):.3g})"
             for base in ("bonded", "lying")
         ]
-        hertz = 4.0 / 3.0 * modulus / 0.75 * math.sqrt(radius) * d**1.5
+        hertz = 4.0 / 3.0 * _MODULUS / 0.75 * math.sqrt(_RADIUS) * d**1.5
         rows.append([f"{1e3 * d:g}", f"{force(d):.3g}", *solid, f"{hertz:.3g}"])
     solid_heads = (f"solid, {base}, ν 0.49 (sticking)" for base in ("bonded", "lying"))
     return _table(("d [mm]", "springs, F [N]", *solid_heads, "Hertz, ν ½"), rows)
@@ -426,17 +432,13 @@ def upright_forces() -> str:
 
 def minimum_strength() -> str:
     """Tabulate c, the energy increase with tilt near upright, for each kind of tip."""
-    from softfinger.kinematics.contact.closed_form import Fingertip
-    from softfinger.kinematics.contact.material import Material
-    from softfinger.kinematics.contact.table import ContactTable
-
     theta, depths, rows = 0.01, (0.001, 0.002, 0.004, 0.006), []
     for name, law in (
         ("springs, before sliding", ()),
         ("solid rubber, lying on its sensor", ("solid", 0.49, "lying")),
         ("solid rubber, bonded", ("solid", 0.49, "bonded")),
     ):
-        table = ContactTable.build(Fingertip(0.020, *law), Material.constant(0.304e6))
+        table = _contact_table(*law)
         found = ((d, table(d, theta)) for d in depths)
         strength = (float(c.energy_theta / (c.force * theta * d)) for d, c in found)
         rows.append([name, *(_signed(each, ".3f") for each in strength)])
@@ -453,7 +455,7 @@ def upright_grips() -> str:
     from softfinger.kinematics.hand.upright import upright_spring
 
     rows = []
-    constant = {"material": {"law": "constant", "modulus": 0.304e6}}
+    constant = {"material": {"law": "constant", "modulus": _MODULUS}}
     for name, sections in (
         ("built-in hand, Table I", {}),
         ("constant E, 0.304 MPa", constant),
@@ -482,11 +484,11 @@ def _left_of(spring: float, d: float, q: float, c: float) -> float:
 
     ``spring`` is in N·m/rad and ``d`` in m.
     """
-    inward, radius = 0.080 * math.sin(q), 0.020
+    inward = 0.080 * math.sin(q)
     b = spring / (_FORCE * 0.050)
     line = _WIDTH * (2.0 * inward + (1.0 - 2.0 * c) * d - b * (_WIDTH - d))
-    rolled = radius - d + inward + 0.5 * (1.0 + b) * d
-    return line / (line - 4.0 * (radius - d + c * d) * rolled)
+    rolled = _RADIUS - d + inward + 0.5 * (1.0 + b) * d
+    return line / (line - 4.0 * (_RADIUS - d + c * d) * rolled)
 
 
 def symmetric_grips() -> str:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
-Columns = Mapping[str, Any]
 Ends = tuple[float, float]
 
 DEPTH = "displacement d [mm]"
@@ -37,7 +36,7 @@ class Sheet:
     """
 
     name: str
-    columns: Columns
+    columns: Mapping[str, Any]
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return the values in column ``name``; raise KeyError if the column does not exist."""
