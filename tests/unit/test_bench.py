@@ -215,7 +215,9 @@ def test_a_watch_measures_forces_times_and_positions():
     ],
 )
 def test_missed_aims_are_listed(aim, changes, missed):
-    case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
-    met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "consistency.left_sensor")])
+    case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",))
+    met = GripTrial(
+        ("left_sensor",), comes=2.0, settled=1.0, events=[(1.29, "consistency.left_sensor")]
+    )
     assert met.missed(case) == []
     assert replace(met, **changes).missed(case) == missed

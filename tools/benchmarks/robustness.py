@@ -17,7 +17,6 @@ from typing import Any
 
 from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.faults import EIGHT_BITS
 from softfinger.tools.benchmarks.measuring import Report
@@ -206,11 +205,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
         hand.command("grasp", force=case.force)
         found.held = hand.until("holding", _GRIP_TIMEOUT)
         loop.advance(_REST_TIME + chance.uniform(0.0, 0.02))
-        over = 0.0
-        if case.words:
-            over = max(event.over for event in parse_faults(case.words.split(), ()))
-            hand.begin(case.words)
-        loop.advance(over + _OBSERVATION_TIME)
+        loop.advance(hand.begin(case.words) + _OBSERVATION_TIME)
         if case.turn:
             hand.command("rotate", angle=case.turn)
             loop.advance(2.0)
