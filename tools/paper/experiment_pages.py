@@ -85,7 +85,7 @@ def _one_tilt(tilt: int, axes: Axes, numbers: Sheet) -> None:
 
 
 def _all_tilts(axes: Axes, numbers: Sheet) -> None:
-    for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
+    for tilt, style in ordered(TILTS):
         axes.plot(numbers["d"], numbers[f"F at {tilt} deg"], **style, label=f"{tilt}°")
 
 
@@ -132,7 +132,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
 
 def _rotation(axes: Axes, rotation: Sheet, _: Sheet) -> None:
     thin: dict[str, Any] = {"color": GREY, "linewidth": 0.7}
-    for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    for d, style in ordered(DEPTHS):
         axes.plot(
             rotation["theta"], rotation[f"F, d up to {d} mm"], **style, label=f"d up to {d} mm"
         )
@@ -144,7 +144,7 @@ def _rotation(axes: Axes, rotation: Sheet, _: Sheet) -> None:
 def _rolling(axes: Axes, _: Sheet, rolling: Sheet) -> None:
     theta = rolling["theta"]
     axes.plot(theta, rolling["F/F(0) at d = 4 mm"], color=INK, label="constant E, every d: 1/cos θ")
-    for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    for d, style in ordered(DEPTHS):
         if d in (DEPTHS[0], DEPTHS[-1]):
             law = rolling[f"F/F(0) of Table I's law at d = {d} mm"]
             axes.plot(theta, law, **style | {"linewidth": 1.1}, label=f"Table I's law, d = {d} mm")
@@ -169,7 +169,8 @@ class Terms(NamedTuple):
 
     def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
         """Return U(d, 0) [J] from eq. 12."""
-        return np.sum(self.terms(radius, modulus, d), axis=0)
+        first, second, third = self.terms(radius, modulus, d)
+        return first + second + third
 
     def terms(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
         """Return each term's contribution [J] to the energy in eq. 12."""

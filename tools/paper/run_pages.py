@@ -245,7 +245,7 @@ def _deep_errors(run: Sheet, symbol: str) -> FloatArray:
 
 
 def _forces(axes: Axes, *sheets: Sheet) -> None:
-    for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
+    for (tilt, style), run in zip(ordered(TILTS), sheets, strict=False):
         axes.plot(run["d"], run["F"], **style, label=f"{tilt}°")
         axes.plot(run["d estimated"][::6], run["F estimated"][::6], **DOT)
     axes.plot([], [], **DOT, label="estimated from the frames")
@@ -253,7 +253,7 @@ def _forces(axes: Axes, *sheets: Sheet) -> None:
 
 def _errors(symbol: str, axes: Axes, *sheets: Sheet) -> None:
     axes.axhline(0.0, color=GREY, linewidth=0.7)
-    for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
+    for (tilt, style), run in zip(ordered(TILTS), sheets, strict=False):
         d, off = run["d"][run["d"] > _RELATIVE_D_MIN], _deep_errors(run, symbol)
         axes.plot(d, off, **style | {"linewidth": 0.9}, label=f"{tilt}°")
 
@@ -312,11 +312,8 @@ def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -
 
 
 def _over_upright(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
-    least = zip(
-        DEPTHS, minima["angle of the least U estimated"], minima["its standard error, U"],
-        ordered(len(DEPTHS)), strict=True,
-    )  # fmt: skip
-    for depth, angle, error, style in least:
+    angles, errors = minima["angle of the least U estimated"], minima["its standard error, U"]
+    for (depth, style), angle, error in zip(ordered(DEPTHS), angles, errors, strict=True):
         theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
         level = float(np.interp(0.0, theta, model))
         found = rolling[f"U estimated at {depth} mm"]
@@ -327,7 +324,7 @@ def _over_upright(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
 
 def _angle_errors(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
     axes.axhline(0.0, color=GREY, linewidth=0.7)
-    for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    for depth, style in ordered(DEPTHS):
         theta = rolling[f"theta at {depth} mm"]
         off = rolling[f"theta estimated at {depth} mm"] - theta
         axes.plot(theta, off, **style | {"linewidth": 0.9}, label=f"d = {depth} mm")

@@ -261,15 +261,9 @@ def slow_turn() -> tuple[Sheet, ...]:
 
 
 def _landscape(axes: Axes, equations: Sheet, _: Sheet, land: Sheet) -> None:
-    for antisymmetric, look in zip(
-        ANTISYMMETRIC_ANGLES, ordered(len(ANTISYMMETRIC_ANGLES)), strict=True
-    ):
-        axes.plot(
-            land[f"angle at {antisymmetric} deg"],
-            land[f"V at {antisymmetric} deg"],
-            **look,
-            label=f"lean {antisymmetric}°",
-        )
+    for lean, look in ordered(ANTISYMMETRIC_ANGLES):
+        angle, v = land[f"angle at {lean} deg"], land[f"V at {lean} deg"]
+        axes.plot(angle, v, **look, label=f"lean {lean}°")
     axes.plot(equations["angle"], equations["V"], color=INK, lw=2.0, label="slow turn")
 
 
