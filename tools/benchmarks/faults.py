@@ -165,24 +165,18 @@ def measure(
     ``brief`` runs one trial per case. ``sweep`` maps trials to outcomes in one or more processes.
     """
     trials, reports = trials or (1 if brief else _TRIAL_COUNT), []
-    cases = [each for aim in (SETTLES, BOUNDED) for each in CASES if each.aim == aim]
-    cases = [case for case in cases if only in case.name]
+    cases = [case for case in CASES if only in case.name]
+    cases.sort(key=lambda case: (SETTLES, BOUNDED).index(case.aim))
     seeds = range(1, trials + 1)
     outcomes = iter(sweep(_outcome, list(itertools.product(cases, seeds))))
-    for aim in (SETTLES, BOUNDED):
+    for aim, group in itertools.groupby(cases, lambda case: case.aim):
         rows = []
-        for case in cases:
-            if case.aim == aim:
-                rows.append(summary(case, [GripTrial(**next(outcomes)) for _ in seeds]))
-                print(f"{case.name}: {rows[-1]['met']} of {trials}", file=sys.stderr, flush=True)
+        for case in group:
+            rows.append(summary(case, [GripTrial(**next(outcomes)) for _ in seeds]))
+            print(f"{case.name}: {rows[-1]['met']} of {trials}", file=sys.stderr, flush=True)
         missed = sum(row["met"] < trials for row in rows)
-        if rows:
-            note = f"  not met: {missed} of {len(rows)}"
-            reports.append(
-                Report(
-                    f"true force / commanded force: {aim}", rows, notes=(note,), failed=missed > 0
-                )
-            )
+        title, note = f"true force / commanded force: {aim}", f"  not met: {missed} of {len(rows)}"
+        reports.append(Report(title, rows, notes=(note,), failed=missed > 0))
     return reports
 
 
