@@ -24,7 +24,7 @@ from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.paper.model_pages import MODULUS, TIP, exponent
 from softfinger.tools.terminal.text_layout import plain_table, table_text
 
-POISSON = 0.49
+POISSON = 0.49  # Poisson's ratio of the solid tips
 DEPTHS = np.linspace(0.001, 0.007, 25)  # m
 TILTS = np.radians(np.linspace(0.0, 20.0, 41))
 FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
