@@ -34,16 +34,14 @@ def _program(name: str) -> Callable[[], str]:
     return lambda: f"# {Path(name).stem}\n\n```python\n{_from(name)()}```\n"
 
 
-def _row(*cells: str) -> str:
+def _row(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
-def _head(*cells: str) -> str:
-    return _row(*cells) + "|---" * len(cells) + "|\n"
-
-
-def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    return _head(*heads) + "".join(_row(*cells) for cells in rows)
+def _table(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table, or an empty string if there are no rows."""
+    body = "".join(map(_row, rows))
+    return body and _row(heads) + "|---" * len(heads) + "|\n" + body
 
 
 def _signed(value: float, form: str) -> str:
@@ -92,26 +90,21 @@ These profiles are installed with softfinger. Select one of them by name, for ex
 def configuration() -> str:
     """List all profile sections and keys from their declarations."""
     from softfinger.daemon.profile import reference
-
-    parts = [_SETTINGS, _head("profile", "description"), *_profiles()]
-    keys = reference.every_key()
-    for name, section in reference.sections().items():
-        parts.append(f"\n## `[{name}]`\n\n{reference.about(section)}\n\n")
-        rows = [key for key in keys if key.section == name]
-        if rows:
-            parts.append(_head("key", "default", "unit", "allowed", "meaning"))
-        for key in rows:
-            cells = (f"`{key.name}`", f"`{key.default}`", key.unit, key.allowed, key.meaning)
-            parts.append(_row(*cells))
-    return "".join(parts)
-
-
-def _profiles() -> list[str]:
-    """Return one table row for each packaged profile."""
     from softfinger.daemon.profile.load import names
     from softfinger.tools.setup.config import subject
 
-    return [_row(f"`{name}`", subject(Path(name))) for name in names()]
+    profiles = ((f"`{name}`", subject(Path(name))) for name in names())
+    parts = [_SETTINGS, _table(("profile", "description"), profiles)]
+    heads = ("key", "default", "unit", "allowed", "meaning")
+    keys = reference.every_key()
+    for name, section in reference.sections().items():
+        rows = (
+            (f"`{key.name}`", f"`{key.default}`", key.unit, key.allowed, key.meaning)
+            for key in keys
+            if key.section == name
+        )
+        parts.append(f"\n## `[{name}]`\n\n{reference.about(section)}\n\n{_table(heads, rows)}")
+    return "".join(parts)
 
 
 # --- the stream -----------------------------------------------------------------------------------
@@ -159,10 +152,7 @@ def commands() -> str:
     from softfinger.daemon.profile.settings import Settings
     from softfinger.daemon.types import NO_LEASE_COMMANDS
 
-    parts = [
-        _COMMANDS,
-        _head("command", "parameters", "accepted in the modes", "needs the lease"),
-    ]
+    rows = []
     for name, each in COMMANDS.items():
         given = ", ".join(
             f"`{key}`" + " (optional)" * (not parameter.required)
@@ -170,23 +160,25 @@ def commands() -> str:
         )
         where = "any" if each.modes == set(Mode) else ", ".join(m for m in Mode if m in each.modes)
         leased = "no" if name in NO_LEASE_COMMANDS | {"stop"} else "yes"
-        parts.append(_row(f"[`{name}`](#{name})", given, where, leased))
+        rows.append((f"[`{name}`](#{name})", given, where, leased))
+    heads = ("command", "parameters", "accepted in the modes", "needs the lease")
+    parts = [_COMMANDS, _table(heads, rows)]
     for name, each in COMMANDS.items():
-        parts.append(f"\n## {name}\n\n{each.action}\n")
-        if each.parameters:
-            parts.append("\n" + _head("parameter", "unit", "range", "meaning"))
+        rows = []
         for key, parameter in each.parameters.items():
             low, high = bounds(Settings(), key)
             numbers = f"{_signed(low, 'g')} to {_signed(high, 'g')}" if low > -math.inf else ""
             allowed = f"{parameter.range} ({numbers})" if parameter.range and numbers else ""
-            cells = parameter.unit, allowed or parameter.range or numbers, parameter.meaning
-            parts.append(_row(f"`{key}`", *cells))
-        if each.reply:
-            parts += ["\n" + _head("reply field", "meaning")]
-            parts += [_row(f"`{field}`", REPLY[field]) for field in each.reply]
-        if each.refusals:
-            parts += ["\n" + _head("reason of the rejection", "cause")]
-            parts += [_row(f"`{reason}`", cause) for reason, cause in each.refusals.items()]
+            allowed = allowed or parameter.range or numbers
+            rows.append((f"`{key}`", parameter.unit, allowed, parameter.meaning))
+        reply = ((f"`{field}`", REPLY[field]) for field in each.reply)
+        refusals = ((f"`{reason}`", cause) for reason, cause in each.refusals.items())
+        parts += [
+            f"\n## {name}\n\n{each.action}\n\n",
+            _table(("parameter", "unit", "range", "meaning"), rows) + "\n",
+            _table(("reply field", "meaning"), reply) + "\n",
+            _table(("reason of the rejection", "cause"), refusals),
+        ]
     return "".join(parts)
 
 
@@ -242,10 +234,7 @@ def limits() -> str:
 
     settings = Settings()
     taking_turns = sum(row.in_turn for row in LIMITS)
-    rows = [
-        _LIMITS,
-        _head("limit", "quantity", "level", "reaction time", "settings and defaults"),
-    ]
+    rows = []
     for row in LIMITS:
         tick = 1e3 / settings.loop.rate
         lasts = getattr(settings.safety, row.lasts) if isinstance(row.lasts, str) else row.lasts
@@ -258,8 +247,9 @@ def limits() -> str:
         else:
             when = "immediate"
         keys = ", ".join(_values(settings, row))
-        rows.append(_row(f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
-    return "".join(rows)
+        rows.append((f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
+    heads = ("limit", "quantity", "level", "reaction time", "settings and defaults")
+    return _LIMITS + _table(heads, rows)
 
 
 # --- events ---------------------------------------------------------------------------------------
@@ -282,10 +272,8 @@ def events() -> str:
     """List all event kinds from the table that explains them."""
     from softfinger.daemon.wire.event_kinds import KINDS
 
-    parts = [_EVENTS, _head("kind", "level", "cause", "what to do")]
-    for kind, each in KINDS.items():
-        parts.append(_row(f"`{kind}`", each.levels, each.cause, each.remedy))
-    return "".join(parts)
+    rows = ((f"`{kind}`", each.levels, each.cause, each.remedy) for kind, each in KINDS.items())
+    return _EVENTS + _table(("kind", "level", "cause", "what to do"), rows)
 
 
 # --- the interface for programs -------------------------------------------------------------------
@@ -361,7 +349,7 @@ def checkpoints() -> str:
 
     rows = []
     for d, theta in ((2, 0), (2, 30), (4, 0), (4, 15), (6, 30), (8, 0), (8, 30)):
-        c = closed_forms(0.304e6, 1e-3 * d, math.radians(theta))
+        c = closed_forms(_MODULUS, 1e-3 * d, math.radians(theta))
         values = c.force, 1e3 * c.energy, c.energy_d, 1e3 * c.energy_theta
         rows.append([str(d), str(theta), *(f"{float(each):.12g}" for each in values)])
     return _table(("d [mm]", "θ [°]", "F [N]", "U [mJ]", "∂U/∂d [N]", "∂U/∂θ [mN·m]"), rows)
@@ -412,17 +400,23 @@ def early_minimum() -> str:
     return _table(("d [mm]", *heads, "U, 5 %, simulated tip"), rows)
 
 
-def upright_forces() -> str:
-    """Tabulate the force on upright tips for several contact laws."""
+_RADIUS, _MODULUS = 0.020, 0.304e6  # tip radius [m] and modulus [Pa] on the pages
+
+
+def _contact_table(*law: Any) -> Any:
+    """Build the contact table of a tip with the given contact law and a constant modulus."""
     from softfinger.kinematics.contact.closed_form import Fingertip
     from softfinger.kinematics.contact.material import Material
     from softfinger.kinematics.contact.table import ContactTable
 
-    radius, modulus = 0.020, 0.304e6
+    return ContactTable.build(Fingertip(_RADIUS, *law), Material.constant(_MODULUS))
+
+
+def upright_forces() -> str:
+    """Tabulate the force on upright tips for several contact laws."""
 
     def force(d: float, *law: Any) -> float:
-        table = ContactTable.build(Fingertip(radius, *law), Material.constant(modulus))
-        return float(table(d, 0.0).force)
+        return float(_contact_table(*law)(d, 0.0).force)
 
     rows = []
     for d in (0.001, 0.002, 0.004, 0.006):
@@ -430,7 +424,7 @@ def upright_forces() -> str:
             f"{force(d, 'solid', 0.49, base):.3g} ({force(d, 'solid', 0.49, base, 'sticking'):.3g})"
             for base in ("bonded", "lying")
         ]
-        hertz = 4.0 / 3.0 * modulus / 0.75 * math.sqrt(radius) * d**1.5
+        hertz = 4.0 / 3.0 * _MODULUS / 0.75 * math.sqrt(_RADIUS) * d**1.5
         rows.append([f"{1e3 * d:g}", f"{force(d):.3g}", *solid, f"{hertz:.3g}"])
     solid_heads = (f"solid, {base}, ν 0.49 (sticking)" for base in ("bonded", "lying"))
     return _table(("d [mm]", "springs, F [N]", *solid_heads, "Hertz, ν ½"), rows)
@@ -438,35 +432,30 @@ def upright_forces() -> str:
 
 def minimum_strength() -> str:
     """Tabulate c, the energy increase with tilt near upright, for each kind of tip."""
-    from softfinger.kinematics.contact.closed_form import Fingertip
-    from softfinger.kinematics.contact.material import Material
-    from softfinger.kinematics.contact.table import ContactTable
-
-    theta, rows = 0.01, []
+    theta, depths, rows = 0.01, (0.001, 0.002, 0.004, 0.006), []
     for name, law in (
         ("springs, before sliding", ()),
         ("solid rubber, lying on its sensor", ("solid", 0.49, "lying")),
         ("solid rubber, bonded", ("solid", 0.49, "bonded")),
     ):
-        table = ContactTable.build(Fingertip(0.020, *law), Material.constant(0.304e6))
-        found = [table(d, theta) for d in (0.001, 0.002, 0.004, 0.006)]
-        depths = (0.001, 0.002, 0.004, 0.006)
-        strength = [
-            float(c.energy_theta / (c.force * theta * d))
-            for c, d in zip(found, depths, strict=True)
-        ]
+        table = _contact_table(*law)
+        found = ((d, table(d, theta)) for d in depths)
+        strength = (float(c.energy_theta / (c.force * theta * d)) for d, c in found)
         rows.append([name, *(_signed(each, ".3f") for each in strength)])
     return _table(("tip", "d = 1 mm", "2 mm", "4 mm", "6 mm"), rows)
 
 
-def _grips() -> list[tuple[str, float, float, float, float]]:
-    """Compute name, d [m], q [rad], c and upright spring [N·m/rad] of 10 N grips on 40 mm."""
+_FORCE, _WIDTH = 10.0, 0.040  # grip force [N] and object width [m] on the pages
+
+
+def upright_grips() -> str:
+    """Tabulate displacement, joint angle, upright spring and residual angle φ/φ0 of a grip."""
     from softfinger.daemon.profile.factory import make_material, make_table
     from softfinger.daemon.profile.settings import Settings
     from softfinger.kinematics.hand.upright import upright_spring
 
-    found = []
-    constant = {"material": {"law": "constant", "modulus": 0.304e6}}
+    rows = []
+    constant = {"material": {"law": "constant", "modulus": _MODULUS}}
     for name, sections in (
         ("built-in hand, Table I", {}),
         ("constant E, 0.304 MPa", constant),
@@ -480,21 +469,10 @@ def _grips() -> list[tuple[str, float, float, float, float]]:
             inward = 0.5 * hand.pivot_separation - tip + d - 0.5 * _WIDTH
             q = math.asin(inward / hand.finger_length)
             low, high = (d, high) if float(table(d, q).force) < _FORCE else (low, d)
-        c = table(d, 0.01)
-        turning = float(c.energy_theta / (c.force * 0.01 * d))
+        contact = table(d, 0.01)
+        c = float(contact.energy_theta / (contact.force * 0.01 * d))
         lengths = 0.5 * hand.pivot_separation, hand.finger_length, hand.finger_offset, tip
-        spring = upright_spring.py_func(q, d, _FORCE, turning, lengths)
-        found.append((name, d, q, turning, spring))
-    return found
-
-
-_FORCE, _WIDTH = 10.0, 0.040  # grip force [N] and object width [m] on the pages
-
-
-def upright_grips() -> str:
-    """Tabulate displacement, joint angle, upright spring and residual angle φ/φ0 of a grip."""
-    rows = []
-    for name, d, q, c, spring in _grips():
+        spring = upright_spring.py_func(q, d, _FORCE, c, lengths)
         angles = (_signed(_left_of(k, d, q, c), ".3f") for k in (0.0, spring, 1e9))
         rows.append([name, f"{1e3 * d:.2f}", f"{math.degrees(q):.1f}", f"{spring:.3f}", *angles])
     heads = ("d [mm]", "q [°]", "k [N·m/rad]", "φ/φ0: no spring", "spring k", "locked fingers")
@@ -506,11 +484,11 @@ def _left_of(spring: float, d: float, q: float, c: float) -> float:
 
     ``spring`` is in N·m/rad and ``d`` in m.
     """
-    inward, radius = 0.080 * math.sin(q), 0.020
+    inward = 0.080 * math.sin(q)
     b = spring / (_FORCE * 0.050)
     line = _WIDTH * (2.0 * inward + (1.0 - 2.0 * c) * d - b * (_WIDTH - d))
-    rolled = radius - d + inward + 0.5 * (1.0 + b) * d
-    return line / (line - 4.0 * (radius - d + c * d) * rolled)
+    rolled = _RADIUS - d + inward + 0.5 * (1.0 + b) * d
+    return line / (line - 4.0 * (_RADIUS - d + c * d) * rolled)
 
 
 def symmetric_grips() -> str:
@@ -571,7 +549,7 @@ def servos() -> str:
     from softfinger.daemon.servos.control_table import MODELS
 
     columns = ("V", "stall [N·m at A]", "N·m/A", "force [N]", "current_max [A]", "force_max [N]")
-    rows = [_head("`servos.model`", *columns)]
+    rows = []
     for name, model in MODELS.items():
         torque, current, volts = model.stall
         low, high = (each / 10 for each in (model.voltage_min, model.voltage_max))
@@ -582,8 +560,8 @@ def servos() -> str:
             bound = 0.4 * torque
             cells[2] = f"{model.torque_constant:.3g}"
             cells[4:] = [f"{0.4 * current:.2g}", f"{bound / 0.06:.2g}, {bound / 0.08:.2g}"]
-        rows.append(_row(f"`{name}`", *cells))
-    return "".join(rows)
+        rows.append([f"`{name}`", *cells])
+    return _table(("`servos.model`", *columns), rows)
 
 
 def _stored(name: str) -> tuple[str, list[dict[str, Any]]]:
@@ -603,13 +581,14 @@ def _shown(rows: Iterable[dict[str, Any]], keys: Sequence[str]) -> Iterable[list
 
 def measured() -> str:
     """Tabulate the results of all default benchmarks (docs/benchmarks.json)."""
+    from softfinger.tools.benchmarks.bench import PAGE_COLUMNS
+
     about, rows = _stored("benchmarks.json")
-    keys = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
     parts = [about]
     shown = (row for row in rows if row.get("median") is not None)
     for title, each in itertools.groupby(shown, key=lambda row: row["table"]):
         heads = (title, "median", "p99", "unit", "aim ≤", "error", "RMS of d [µm]")
-        parts.append("\n" + _table(heads, _shown(each, keys)))
+        parts.append("\n" + _table(heads, _shown(each, PAGE_COLUMNS)))
     return "".join(parts)
 
 

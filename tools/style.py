@@ -8,10 +8,11 @@ pattern. Unordered categories use the Okabe-Ito palette.
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from softfinger.tools.extras import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Value = TypeVar("Value")
 
 DPI = 200
 GREY = "#707070"
@@ -76,12 +79,13 @@ def save(figure: Figure, path: Path) -> None:
         file.write(picture.getbuffer())
 
 
-def ordered(count: int) -> list[dict[str, Any]]:
-    """Return colours and dashes for an ordered family of lines; the first is a light solid line."""
+def ordered(values: Sequence[Value]) -> list[tuple[Value, dict[str, Any]]]:
+    """Pair each value with the colour and dashes of its line; the first is a light solid line."""
     import matplotlib
 
-    shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, count))
-    return [{"color": shades[i], "linestyle": _DASHES[i % len(_DASHES)]} for i in range(count)]
+    shades = matplotlib.colormaps["viridis"](np.linspace(0.72, 0.0, len(values)))
+    lines = zip(values, shades, itertools.cycle(_DASHES), strict=False)
+    return [(value, {"color": shade, "linestyle": dashes}) for value, shade, dashes in lines]
 
 
 def caption(figure: Figure, lines: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lerobot_robot_softfinger.features import FULL_SCALE, IMAGES, STATE, observation
+from lerobot_robot_softfinger.features import IMAGES, STATE, image, observation
 from softfinger.gym.environment import ANGLE, FORCES, REACH, SoftFingerEnv
 
 _DESCRIPTIONS = {
@@ -33,12 +33,12 @@ class LeRobotHand(gymnasium.Wrapper):
         self.task, self.task_description = task, _DESCRIPTIONS[task]
         self._by_law = control == "law"
         rows, cols = self._hand.observation_space["pressure"].shape[1:]
-        image = spaces.Box(0, 255, (rows, cols, 3), np.uint8)
+        picture = spaces.Box(0, 255, (rows, cols, 3), np.uint8)
         self.observation_space = spaces.Dict(
             {
                 "agent_pos": spaces.Box(-np.inf, np.inf, (len(STATE),), np.float32),
                 "environment_state": spaces.Box(-np.inf, np.inf, (1,), np.float32),
-                "pixels": spaces.Dict(dict.fromkeys(IMAGES.values(), image)),
+                "pixels": spaces.Dict(dict.fromkeys(IMAGES.values(), picture)),
             }
         )
         low, high = (FORCES[0], -ANGLE), (FORCES[1], ANGLE)
@@ -68,15 +68,10 @@ class LeRobotHand(gymnasium.Wrapper):
             name: SimpleNamespace(mono_ns=state.mono_ns - 1e9 * getattr(state, name).frame_age_s)
             for name in IMAGES
         }
-        scale = self._hand.pascal_per_count * 255.0 / FULL_SCALE
-        grey = np.rint(np.minimum(found["pressure"] * scale, 255.0)).astype(np.uint8)
-        images = {
-            name: np.repeat(each[..., None], 3, axis=2)
-            for name, each in zip(IMAGES.values(), grey, strict=True)
-        }
+        images = map(image, found["pressure"] * self._hand.pascal_per_count)
         values = observation(state, frames)
         return {
             "agent_pos": np.array([values[name] for name in STATE], np.float32),
             "environment_state": found["goal"],
-            "pixels": images,
+            "pixels": dict(zip(IMAGES.values(), images, strict=True)),
         }

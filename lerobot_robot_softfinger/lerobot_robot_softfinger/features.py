@@ -40,7 +40,7 @@ def observation(state: HandState, frames: Mapping[str, TactileFrame]) -> dict[st
     return dict(zip(STATE, finite, strict=True))
 
 
-def image(frame: TactileFrame, full_scale: float = FULL_SCALE) -> NDArray[np.uint8]:
-    """Convert a frame to an image [rows, cols, 3]; ``full_scale`` [Pa] and above is white."""
-    grey = np.clip(np.rint(frame.pressure * (255.0 / full_scale)), 0.0, 255.0)
+def image(pressure: NDArray[np.float64], full_scale: float = FULL_SCALE) -> NDArray[np.uint8]:
+    """Convert pressures [Pa] to an image [rows, cols, 3]; ``full_scale`` and above is white."""
+    grey = np.clip(np.rint(pressure * (255.0 / full_scale)), 0.0, 255.0)
     return np.repeat(grey.astype(np.uint8)[:, :, np.newaxis], 3, axis=2)

@@ -100,7 +100,7 @@ class Softfinger(Robot):
             while True:
                 self._take(self._waiting.next(0.0))
         images = {
-            IMAGES[name]: image(frame, self.config.full_scale)
+            IMAGES[name]: image(frame.pressure, self.config.full_scale)
             for name, frame in self._frames.items()
         }
         return observation(state, self._frames) | images

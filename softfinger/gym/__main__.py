@@ -10,6 +10,7 @@ import argparse
 import itertools
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -44,13 +45,10 @@ def _tried(profile: str, case: tuple[str, str, int]) -> tuple[float, float]:
     """Run one episode; return the sum of its rewards and its run time [s]."""
     task, agent, seed = case
     name = f"SoftFinger-{task.capitalize()}-v0"
-    env = gymnasium.make(name, control=AGENTS[agent], profile=profile)
-    began = time.perf_counter()
-    try:
+    with closing(gymnasium.make(name, control=AGENTS[agent], profile=profile)) as env:
+        began = time.perf_counter()
         found = episode(env, by_law if agent == "law" else at_random(env), seed)
         return found, time.perf_counter() - began
-    finally:
-        env.close()
 
 
 def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> float:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -20,13 +21,14 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from softfinger.gym import SECONDS, STEP
 from softfinger.gym.__main__ import Policy, episode
-from softfinger.gym.environment import FORCE, Observation, SoftFingerEnv
+from softfinger.gym.environment import FORCE, Observation
 from softfinger.tools import style
 from softfinger.tools.sweep import Sweep, add_sweep
 
 SAMPLE_COUNT, ELITE_COUNT, EPISODES = 24, 6, 2  # samples, elites, and episodes per sample
-STEPS = 200
+STEPS = round(SECONDS / STEP)
 FEATURES = 5
 # Scale of the weights. An action of 1 means 1 rad/s, so small weights limit the joint speed.
 _WEIGHT_SCALE = 0.2
@@ -53,13 +55,9 @@ def policy(weights: Weights) -> Policy:
 
 def returns(seed: int, shaped: bool, weights: Weights) -> float:
     """Compute the mean return of EPISODES episodes with consecutive seeds from ``seed`` on."""
-    env = SoftFingerEnv("grasp", shaped=shaped)
-    limited = gymnasium.wrappers.TimeLimit(env, STEPS)
-    try:
+    with closing(gymnasium.make("SoftFinger-Grasp-v0", shaped=shaped)) as env:
         act = policy(weights)
-        return float(np.mean([episode(limited, act, seed + k) for k in range(EPISODES)]))
-    finally:
-        limited.close()
+        return float(np.mean([episode(env, act, seed + k) for k in range(EPISODES)]))
 
 
 def learn(

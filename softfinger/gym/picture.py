@@ -102,6 +102,7 @@ class Window:
                 f"render_mode: found 'human', but no window can be opened: {error}; use a display "
                 "and a Python installation with tkinter, or render_mode 'rgb_array'"
             ) from None
+        self._closed_error = tkinter.TclError  # raised after the user has closed the window
         self._root.title(title)
         self._photo = tkinter.PhotoImage(width=WIDTH, height=HEIGHT)
         tkinter.Label(self._root, image=self._photo).pack()
@@ -110,16 +111,12 @@ class Window:
         """If the window is open, show an image ``period`` [s] after the previous image."""
         time.sleep(max(self._shown + period - time.monotonic(), 0.0))
         self._shown = time.monotonic()
-        import tkinter
-
-        with contextlib.suppress(tkinter.TclError):
+        with contextlib.suppress(self._closed_error):
             head = f"P6 {WIDTH} {HEIGHT} 255\n".encode()
             self._photo.configure(data=head + image.tobytes())
             self._root.update()
 
     def close(self) -> None:
         """Close the window."""
-        import tkinter
-
-        with contextlib.suppress(tkinter.TclError):
+        with contextlib.suppress(self._closed_error):
             self._root.destroy()

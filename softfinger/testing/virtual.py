@@ -269,9 +269,9 @@ class VirtualHand(VirtualTimeHand):
 
     Parameters
     ----------
-    profile : name or file of a profile with a simulated hand; None for the default settings changes
-    : settings to change, in the form of ``--set`` plant : settings, in the same form, that apply
-    only to the simulated hand and not to the daemon
+    profile : name or file of a profile with a simulated hand; None for the default settings
+    changes : settings to change, in the form of ``--set``
+    plant : settings, in the same form, that apply only to the simulated hand and not to the daemon
 
     Attributes
     ----------

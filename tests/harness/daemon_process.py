@@ -1,15 +1,18 @@
-"""Run ``softfinger`` in separate processes: daemons and short-lived subcommands."""
+"""Run ``softfinger`` in separate processes: daemons, subcommands and installed plugins."""
 
+import os
 import shutil
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.client.command_client import send
 
+ROOT = Path(__file__).parents[2]
 SOFTFINGER = [sys.executable, "-m", "softfinger"]
 # Settings that tolerate stalls on a busy machine, for tests that are not about timeouts.
 PATIENCE = {
@@ -44,6 +47,22 @@ def pip_installed(package: Path, folder: Path) -> Path:
     done = python("-m", "pip", *words)
     assert done.returncode == 0, done.stderr
     return folder / "site"
+
+
+def plugin_path(folder: Path) -> str:
+    """Make this repository's pytest plugin visible to other processes, as if it were installed.
+
+    Write the metadata of a package to ``folder``, with the entry points of pyproject.toml. Return
+    the resulting PYTHONPATH.
+    """
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    entries = project["entry-points"]["pytest11"]
+    info = folder / "softfinger_plugin-0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: softfinger-plugin\nVersion: 0\n")
+    lines = ["[pytest11]", *(f"{name} = {module}" for name, module in entries.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return os.pathsep.join([str(folder), str(ROOT)])
 
 
 def started(*words: object, **options: Any) -> subprocess.Popen[str]:

@@ -22,7 +22,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.tools.arguments import profile
 from softfinger.tools.cli import main, make_parser
 from softfinger.tools.terminal.status import describe
-from tests.harness.daemon_process import SOFTFINGER, Running
+from tests.harness.daemon_process import SOFTFINGER, Running, started
 
 _BUSY = "DOCUMENTED_BUSY"  # environment variable that makes `softfinger` run as a separate process
 _ENDLESS = {"run", "monitor", "view", "replay", "envelope", "bench"}
@@ -101,11 +101,14 @@ class Softfinger:
             for each in ("stream", "commands"):
                 words += ["--set", f"{each}.address=ipc://{Path.cwd()}/{each}"]
             return subprocess.run([*SOFTFINGER, *words, "--duration", "1"], check=False).returncode
-        with mock.patch.object(os, "nice"), mock.patch.dict(os.environ, {_BUSY: "1"}):
-            if name != "doctor":
-                return main(words)
-            with _patient_doctor():
-                return main(words)
+        with (
+            mock.patch.object(os, "nice"),
+            mock.patch.dict(os.environ, {_BUSY: "1"}),
+            # The default addresses are not available to a test. 100 wake-ups take too long.
+            mock.patch("softfinger.tools.setup.doctor.check_addresses", return_value=[]),
+            mock.patch("softfinger.daemon.diagnosis.machine._WAKE_UP_COUNT", 5),
+        ):
+            return main(words)
 
     def _run(self, words: list[str]) -> int:
         """Run the daemon of an emulated hand, which receives all later commands."""
@@ -125,7 +128,7 @@ class Softfinger:
 
     def _emulate(self, words: list[str]) -> int:
         self.end()
-        self._emulator = subprocess.Popen([*SOFTFINGER, *words], stdout=subprocess.PIPE, text=True)
+        self._emulator = started(*words, stderr=None)
         return 0 if self._emulator.stdout.readline() == "ready\n" else 1
 
     def end(self) -> None:
@@ -160,17 +163,3 @@ def _await(shown: str) -> int:
             print(f"status: the page shows {shown[2:]!r}: {error}; the hand: {now}")
             return 1
     return 0
-
-
-def _patient_doctor() -> contextlib.ExitStack:
-    """Skip the doctor's address check, and shorten the doctor's wake-up measurement."""
-    from softfinger.daemon.diagnosis import machine
-    from softfinger.tools.setup import doctor
-
-    stack = contextlib.ExitStack()
-    for module, name, value in (
-        (doctor, "check_addresses", lambda _: []),
-        (machine, "_WAKE_UP_COUNT", 5),
-    ):
-        stack.enter_context(mock.patch.object(module, name, value))
-    return stack

@@ -6,7 +6,6 @@ import contextlib
 import re
 import select
 import signal
-import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.emulator import Emulator
 from softfinger.daemon.tactile.flexitac import FlexiTac
 from softfinger.tools.cli import main
-from tests.harness.daemon_process import SOFTFINGER
+from tests.harness.daemon_process import started
 
 HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 _COMPILED = re.compile(r"^(compil(ing|ed) .*|.*: \d+ of about \d+, .*)\n", re.MULTILINE)
@@ -49,10 +48,7 @@ class EmulatorProcess:
     """A ``softfinger emulate`` process with the given arguments."""
 
     def __init__(self, *arguments: str | Path) -> None:
-        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        self.popen: subprocess.Popen[str] = subprocess.Popen(
-            [*SOFTFINGER, "emulate", *arguments], **pipes
-        )
+        self.popen = started("emulate", *arguments)
 
     def ready(self) -> EmulatorProcess:
         """Wait for the first line, which must be ``ready``."""
@@ -90,10 +86,10 @@ class PatientPort(PortHandler):
 class SdkServos:
     """Access to the emulated servos through the manufacturer's SDK."""
 
-    def __init__(self, folder: Path, baud: int = 2_000_000) -> None:
+    def __init__(self, folder: Path) -> None:
         self.port = PatientPort(str(folder / "servos"))
         assert self.port.openPort()
-        assert self.port.setBaudRate(baud)
+        assert self.port.setBaudRate(2_000_000)
         self.packets = PacketHandler(2.0)
 
     def ping(self, servo: int) -> int:
@@ -123,10 +119,10 @@ class SdkServos:
         self.port.closePort()
 
 
-def board(folder: Path, finger: int, timeout: float = 60.0, **changes: object) -> FlexiTac:
+def board(folder: Path, finger: int, **changes: object) -> FlexiTac:
     """Open the daemon's backend for one board of the emulated hand."""
     tactile = load(HIL, folder).tactile
-    tactile = tactile.model_copy(update={"open_timeout": timeout, **changes})
+    tactile = tactile.model_copy(update={"open_timeout": 60.0, **changes})
     return FlexiTac(tactile, RealClock(), finger)
 
 

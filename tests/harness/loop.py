@@ -1,10 +1,11 @@
-"""Run a complete daemon in virtual time, without sockets."""
+"""Run a complete daemon in virtual time, without sockets, and simulate late wake-ups."""
 
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
@@ -19,6 +20,28 @@ _message = message_maker(STATE)
 def state_message(daemon: Daemon) -> dict[str, Any]:
     """Return the ``hand/state`` message of the current tick."""
     return _message(daemon.loop.state, parts(daemon.settings))
+
+
+class LateMachine(VirtualClock):
+    """Test clock that replaces the real clock. Only `work` and sleeps advance the time.
+
+    ``late_by`` holds the delays of the next wake-ups [s].
+    """
+
+    pauses_when_late = False
+
+    def __init__(self, start: float = 0.0) -> None:
+        super().__init__(start)
+        self.late_by: list[float] = []
+
+    def work(self, seconds: float) -> None:
+        """Advance the clock by the duration of some work."""
+        self._now += seconds
+
+    def sleep_until(self, t: float) -> float:
+        late = self.late_by.pop(0) if self.late_by else 0.0
+        super().sleep_until(t + late)
+        return late
 
 
 def command(daemon: Daemon, name: str, **numbers: float) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from typing import Any
 import pyte
 
 _CAPACITY = 1 << 16  # capacity of a terminal buffer [bytes]
+_TIMEOUT = 150.0  # s
 ENVIRONMENT = {"TERM": "xterm-256color", "COLORTERM": "truecolor", "LANG": "C.UTF-8"}
 
 
@@ -63,20 +64,20 @@ class TerminalProcess:
     def text(self) -> str:
         return "\n".join(self.screen.display)
 
-    def wait(self, condition: Callable[[], Any], seconds: float = 150.0) -> None:
+    def wait(self, condition: Callable[[], Any]) -> None:
         """Read output until ``condition`` is true; on a timeout, fail with the screen's text."""
-        deadline = time.monotonic() + seconds
+        deadline = time.monotonic() + _TIMEOUT
         while not condition():
             self.pump()
             if time.monotonic() > deadline:
-                raise AssertionError(f"not within {seconds:g} s; the page:\n{self.text()}")
+                raise AssertionError(f"not within {_TIMEOUT:g} s; the page:\n{self.text()}")
 
-    def shows(self, *texts: str, seconds: float = 150.0) -> None:
+    def shows(self, *texts: str) -> None:
         def shown() -> bool:
             page = self.text()
             return all(text in page for text in texts)
 
-        self.wait(shown, seconds)
+        self.wait(shown)
 
     def type(self, keys: bytes) -> None:
         os.write(self.master, keys)

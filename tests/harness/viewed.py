@@ -1,14 +1,13 @@
 """Run ``softfinger view`` as a process and receive its pictures as a browser page does."""
 
 import json
-import subprocess
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlsplit
 
 from websockets.sync.client import connect
 
-from tests.harness.daemon_process import SOFTFINGER
+from tests.harness.daemon_process import started
 
 WAIT = 60.0  # timeout for one picture [s]
 
@@ -22,13 +21,7 @@ class Viewed:
     """
 
     def __init__(self, *words: str, folder: Path | None = None) -> None:
-        self.process = subprocess.Popen(
-            [*SOFTFINGER, "view", *words, "--no-browser", "--port", "0"],
-            cwd=folder,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        self.process = started("view", *words, "--no-browser", "--port", "0", cwd=folder)
         self.address = self.commanding = ""
         for line in self.process.stdout:
             self.commanding = self.commanding or line.split()[1]

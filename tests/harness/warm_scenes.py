@@ -30,7 +30,6 @@ from softfinger.daemon.profile.settings import Settings
 from tests.harness.daemon_process import PATIENCE
 
 CALIBRATED, STAND_IN = "calibrated sensor", "stand-in hand"
-HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 SCENES: dict[str, dict[str, Any]] = {
     "two fingers": {},
     "left finger, constant modulus": {
@@ -126,7 +125,7 @@ def main(folder: Path, names: list[str]) -> None:
     }
     if STAND_IN in names:
         changes = [f"{key}={value}" for key, value in PATIENCE.items()]
-        scenes[STAND_IN] = load(HIL, folder, changes)
+        scenes[STAND_IN] = load(Path("hil"), folder, changes)
     for name in names:
         child = os.fork()
         if child == 0:

@@ -20,7 +20,7 @@ from tests.conftest import until
 from tests.harness.daemon_process import python, softfinger, started
 from tests.harness.descendants import ending
 from tests.harness.emulated import EmulatorProcess
-from tests.harness.warm_scenes import CALIBRATED, HIL, SCENES, STAND_IN
+from tests.harness.warm_scenes import CALIBRATED, SCENES, STAND_IN
 
 BARE = ["--set", "servos.backend=dynamixel", "--set", "tactile.backend=none"]
 
@@ -128,7 +128,7 @@ def test_ctrl_c_ends_every_compiler_process(tmp_path):
 def test_no_kernel_is_compiled_or_loaded_in_a_running_loop(tmp_path, names):
     with contextlib.ExitStack() as stack:
         if STAND_IN in names:
-            hand = stack.enter_context(EmulatorProcess("--dir", tmp_path, "--config", HIL))
+            hand = stack.enter_context(EmulatorProcess("--dir", tmp_path, "--config", "hil"))
             hand.ready()
         done = python("-m", "tests.harness.warm_scenes", tmp_path, *names)
     told: dict[str, dict[str, Any]] = {}

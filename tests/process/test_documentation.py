@@ -31,9 +31,8 @@ import pytest
 from softfinger.daemon.client.command_client import HandClient, send
 from softfinger.daemon.profile.load import find, load
 from tests.conftest import own_addresses
-from tests.harness.daemon_process import Running
+from tests.harness.daemon_process import Running, plugin_path
 from tests.harness.documented import Softfinger, parse
-from tests.harness.installed_plugin import plugin_path
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]

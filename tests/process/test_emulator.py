@@ -26,7 +26,7 @@ from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, Lin
 from softfinger.daemon.tactile.base import make_sensor
 from tests.conftest import until
 from tests.harness.emulated import HIL, EmulatorProcess, SdkServos, board, emulated, send
-from tests.harness.late_machine import LateMachine
+from tests.harness.loop import LateMachine
 
 RETURN_DELAY, OPERATING_MODE, TORQUE_ENABLE, PRESENT_POSITION = 9, 11, 64, 132
 

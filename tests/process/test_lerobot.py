@@ -226,7 +226,7 @@ def test_unknown_values_and_values_without_contact_are_zero():
 
 
 def test_an_image_is_linear_and_saturates_at_full_scale():
-    found = image(frame([[0, 1, 50], [100, 101, 65535]], 0.0), full_scale=100e3)
+    found = image(frame([[0, 1, 50], [100, 101, 65535]], 0.0).pressure, full_scale=100e3)
     assert found.dtype == np.uint8
     assert found.shape == (2, 3, 3)
     for channel in range(3):

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from softfinger.daemon.profile.load import load
-from softfinger.tools.benchmarks.rigs import HIL
 from tests.soak import hil
 from tests.soak.rig import judge_wire
 
@@ -63,7 +62,8 @@ def servo(**changed: Any) -> dict[str, Any]:
 
 
 def judged(*servos: dict[str, Any]) -> str:
-    rig: Any = SimpleNamespace(settings=load(HIL, Path("hand")), report=lambda: {"servos": servos})
+    settings = load(Path("hil"), Path("hand"))
+    rig: Any = SimpleNamespace(settings=settings, report=lambda: {"servos": servos})
     return judge_wire(rig)
 
 

@@ -9,8 +9,7 @@ from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.simulation.emulator.folder import NoEmulator
 from softfinger.daemon.simulation.faults import FaultError
 from softfinger.testing import EmulatedBus, EmulatedHand, VirtualHand
-from tests.harness.daemon_process import python
-from tests.harness.installed_plugin import plugin_path
+from tests.harness.daemon_process import plugin_path, python
 
 SERVOS = """
 import dynamixel_sdk as sdk

@@ -30,9 +30,10 @@ import numpy as np
 from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.errors import NoStream
-from softfinger.tools.benchmarks.rigs import SOFTFINGER, RigError
+from softfinger.tools.benchmarks.rigs import RigError
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
+from tests.harness.daemon_process import SOFTFINGER
 from tests.soak.rig import CASES, End, Rig, judge_wire
 
 SECONDS = 3600.0

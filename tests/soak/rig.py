@@ -21,11 +21,12 @@ import zmq
 
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.daemon.profile.load import load
+from softfinger.daemon.profile.load import find, load
 from softfinger.daemon.simulation.emulator.folder import carry_out
 from softfinger.daemon.wire.schema import STATE
-from softfinger.tools.benchmarks.rigs import HIL, SOFTFINGER, RigError
+from softfinger.tools.benchmarks.rigs import RigError
 from softfinger.tools.processes.emulate import emulator_process
+from tests.harness.daemon_process import SOFTFINGER
 
 _PATIENCE = 300.0  # timeout for the start of a process, including kernel compilation [s]
 _STATE_RATE = 250.0  # Hz
@@ -56,7 +57,8 @@ class Rig:
             f'stream.address = "{self.stream}"\ncommands.address = "{self.commands}"\n'
             f'stream.state_rate = {_STATE_RATE}\nloop.clock = "real"\n'
         )
-        self.config.write_text(head + HIL.read_text(encoding="utf-8"), encoding="utf-8")
+        hil = find(Path("hil")).read_text(encoding="utf-8")
+        self.config.write_text(head + hil, encoding="utf-8")
         self.settings = load(self.config, self.ports)
         self.context: zmq.Context[Any] = zmq.Context()
         self._running = contextlib.ExitStack()  # context of the emulated hand

@@ -2,7 +2,6 @@
 
 import json
 import math
-import random
 from dataclasses import replace
 from functools import partial
 from timeit import Timer
@@ -11,29 +10,11 @@ import pytest
 
 from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
-from softfinger.tools.benchmarks import (
-    bench,
-    control,
-    estimator,
-    faults,
-    measuring,
-    reflex,
-    tick,
-)
-from softfinger.tools.benchmarks.faults import (
-    BOUNDED,
-    SETTLES,
-    FaultCase,
-    GripTrial,
-    measure,
-)
-from softfinger.tools.benchmarks.measuring import (
-    Report,
-    figure,
-    interleave,
-)
+from softfinger.tools.benchmarks import bench, control, estimator, faults, measuring, reflex, tick
+from softfinger.tools.benchmarks.faults import BOUNDED, SETTLES, FaultCase, GripTrial, measure
+from softfinger.tools.benchmarks.measuring import Report, figure, interleave
 from softfinger.tools.benchmarks.rigs import RigError
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch
+from softfinger.tools.benchmarks.virtual_grip import Watch
 
 
 def test_interleaved_timing(monkeypatch):
@@ -196,15 +177,6 @@ def test_a_held_load_slides_and_a_lost_load_is_reported():
     assert 0.0 <= lost.said < 1.0
 
 
-def holding(force: float = 8.0) -> VirtualGrip:
-    grip = VirtualGrip.drawn(1, random.Random(1), {})
-    grip.command("arm")
-    grip.loop.advance(0.1)
-    grip.command("grasp", force=force)
-    assert grip.until("holding", 3.0)
-    return grip
-
-
 @pytest.mark.extended
 def test_an_ideal_hand_meets_its_aim():
     (table,) = measure(trials=2, only="6 N: no fault")
@@ -243,7 +215,9 @@ def test_a_watch_measures_forces_times_and_positions():
     ],
 )
 def test_missed_aims_are_listed(aim, changes, missed):
-    case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",), comes=2.0)
-    met = GripTrial(("left_sensor",), settled=1.0, events=[(1.29, "consistency.left_sensor")])
+    case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",))
+    met = GripTrial(
+        ("left_sensor",), comes=2.0, settled=1.0, events=[(1.29, "consistency.left_sensor")]
+    )
     assert met.missed(case) == []
     assert replace(met, **changes).missed(case) == missed

@@ -19,7 +19,6 @@ from softfinger.kinematics.estimation.state import (
     cells_in,
 )
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from tests.harness.called import called
 from tests.harness.paper_tip import LINEAR, PITCH, TIP, E
 
 FloatArray = NDArray[np.float64]
@@ -77,7 +76,7 @@ def test_activity_matches_plain_numpy():
     assert seen == {True, False}
 
 
-free_noise = called(free_noise)
+free_noise = kernel(free_noise.py_func)
 
 erfc = np.vectorize(math.erfc)
 

@@ -1,6 +1,7 @@
 """Test the paths and the estimation errors of the paper's experiments in simulation."""
 
 import math
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ def sheets() -> tuple[Sheet, ...]:
 
 def test_forces_are_energy_derivatives():
     """Compare the joint torques with finite differences of the energy along rolling motions."""
-    here = slow_turn.turned(np.radians([2.0, 4.0]), slow_turn.gripped())[-1]
+    here = reduce(slow_turn.turned, np.radians([2.0, 4.0]), slow_turn.gripped())
     step = 1e-6
     for k in range(5):
         moved = []

@@ -18,12 +18,9 @@ from softfinger.tools import cli, style
 from softfinger.tools.paper import experiment_pages, figures, validate
 from softfinger.tools.paper.model_pages import double_integrals
 from softfinger.tools.paper.validate import PublishedValue
-from tests.harness.paper_tip import CHECKPOINTS
+from tests.harness.paper_tip import CHECKPOINTS, LINEAR
 
 NUMBERS = ("fig3", "fig4a", "fig4b", "fig5a", "fig5b", "fig7", "fig10", "fig10_shear")
-
-
-LINEAR = Material.constant(0.304e6)
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:

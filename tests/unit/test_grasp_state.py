@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from softfinger import ContactTable, Fingertip, Material
+from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import (
     held_motion,
@@ -15,17 +16,16 @@ from softfinger.kinematics.hand.grasp_state import (
     sheared_gradient,
     total_tilt,
 )
-from tests.harness.called import called
 from tests.harness.grasp import Grasp, GraspState, sheared_contact
 from tests.harness.paper_tip import E
 from tests.harness.plant import PAPER
 from tests.harness.reference_hand import ReferenceHand
 
-holding_moment_arms = called(holding_moment_arms)
-sheared_gradient = called(sheared_gradient)
-held_motion = called(held_motion)
-load_of = called(load_of)
-load_torques = called(load_torques)
+holding_moment_arms = kernel(holding_moment_arms.py_func)
+sheared_gradient = kernel(sheared_gradient.py_func)
+held_motion = kernel(held_motion.py_func)
+load_of = kernel(load_of.py_func)
+load_torques = kernel(load_torques.py_func)
 
 HAND = ReferenceHand(finger_offset=0.003)
 LENGTHS = (HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)

@@ -16,8 +16,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.timing import ATTRIBUTION_TIME, REPORT_INTERVAL, Lateness
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Timing
-from tests.harness.late_machine import LateMachine
-from tests.harness.loop import advance_to, grasped, state_message
+from tests.harness.loop import LateMachine, advance_to, grasped, state_message
 
 MOMENT = ("timestamp", "tick_s", "compute_s", "wake_late_s", "overruns", "behind_s")
 Build = Callable[..., tuple[Daemon, LateMachine, list[tuple[str, str, str]]]]

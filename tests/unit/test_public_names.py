@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import softfinger
+from softfinger import testing
 from softfinger.daemon.wire.fields import TOPICS, members
 
 ROOT = Path(softfinger.__file__).parents[1]
@@ -93,6 +94,13 @@ def test_every_public_name_and_method_is_documented(name):
             if isinstance(member, documented) and not inspect.getdoc(getattr(found, each))
         ]
         assert wanting == []
+
+
+@pytest.mark.parametrize("name", [name for name in testing.__all__ if name[0].isupper()])
+def test_every_parameter_of_a_test_hand_is_documented(name):
+    cls = getattr(testing, name)
+    told = re.findall(r"(?m)^(\w[\w, ]*) : ", inspect.getdoc(cls) or "")
+    assert {*inspect.signature(cls).parameters} <= {n for each in told for n in each.split(", ")}
 
 
 def imported() -> list[tuple[str, str]]:

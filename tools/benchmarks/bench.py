@@ -34,7 +34,7 @@ MEASUREMENTS = {
 # These benchmarks run in virtual time, so other programs do not affect their results.
 SWEPT = ("reflex", "faults", "robustness")
 PAGE = ("estimator", "tick")
-_PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
+PAGE_COLUMNS = ("median", "p99", "unit", "aim ≤", "relative error", "RMS of d [µm]")
 _CASES = ("faults", "robustness")
 # Options that apply only to some measurements.
 _OWN = {"full": ("reflex",), "trials": _CASES, "only": _CASES}
@@ -152,7 +152,7 @@ def _kept(name: str, tables: list[Report]) -> list[Row]:
 
 def _page(tables: list[Report]) -> list[Row]:
     return [
-        {"name": f"{table.title}: {row['name']}"} | {key: row.get(key) for key in _PAGE_COLUMNS}
+        {"name": f"{table.title}: {row['name']}"} | {key: row.get(key) for key in PAGE_COLUMNS}
         for table in tables
         for row in table.rows
     ]

@@ -196,7 +196,7 @@ def measure(brief: bool = False) -> list[Report]:
     ]
 
 
-def drawn(count: int = _DRAW_COUNT) -> list[dict[str, Any]]:
+def drawn(count: int) -> list[dict[str, Any]]:
     """Create random plants that differ from the settings; all control laws use the same plants."""
     rng = np.random.default_rng(16)
     return [

@@ -63,7 +63,6 @@ class FaultCase:
     force: float  # requested force [N]
     words: str = ""
     false: tuple[str, ...] = ()  # channels that may be reported as faulty
-    comes: float = 0.0  # time over which the fault develops [s]
     before: bool = False
     then: float = 0.0  # second requested force [N]
     settings: Sections = field(default_factory=dict)
@@ -80,13 +79,13 @@ def _cases(force: float) -> Iterator[FaultCase]:
         for gain in (0.5, 0.7, 0.85, 1.3, 1.6):
             lies, words = partial(settles, false=false), f"{side}gain={gain}"
             yield lies(f"{who}, gain {gain:g} from the start", words=words, before=True)
-            yield lies(f"{who}, gain {gain:g} in 2 s", words=f"{words}@0..2", comes=2.0)
+            yield lies(f"{who}, gain {gain:g} in 2 s", words=f"{words}@0..2")
             yield lies(f"{who}, gain {gain:g} at once", words=words)
         lies = partial(bounded, false=false)
         for drift in (0.2, -0.2):
             words = f"{side}drift={drift}@0..2"
             name = f"{who}, zero {drift:+.0%} of full scale in 2 s"
-            yield lies(name, words=words, comes=2.0, settings=EIGHT_BITS)
+            yield lies(name, words=words, settings=EIGHT_BITS)
         for kind, change in (
             ("shift-x=3", "shifted by 3 cells"),
             ("shift-x=-3", "shifted by -3 cells"),
@@ -123,6 +122,7 @@ class GripTrial:
     """
 
     false: tuple[str, ...]  # channels that may be reported as faulty
+    comes: float = 0.0  # time over which the fault develops [s]
     held: bool = True  # True if the mode `holding` was reached
     settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
     peak: float = 0.0  # maximum force of either tip
@@ -142,7 +142,7 @@ class GripTrial:
     def missed(self, case: FaultCase) -> list[str]:
         """Return the criteria that the trial did not meet."""
         low, high = _SETTLED_RANGE
-        named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * case.comes
+        named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * self.comes
         wrong = {
             "not held": not self.held and not case.before,
             "wrong report": bool(self.named(False)),
@@ -165,24 +165,18 @@ def measure(
     ``brief`` runs one trial per case. ``sweep`` maps trials to outcomes in one or more processes.
     """
     trials, reports = trials or (1 if brief else _TRIAL_COUNT), []
-    cases = [each for aim in (SETTLES, BOUNDED) for each in CASES if each.aim == aim]
-    cases = [case for case in cases if only in case.name]
+    cases = [case for case in CASES if only in case.name]
+    cases.sort(key=lambda case: (SETTLES, BOUNDED).index(case.aim))
     seeds = range(1, trials + 1)
     outcomes = iter(sweep(_outcome, list(itertools.product(cases, seeds))))
-    for aim in (SETTLES, BOUNDED):
+    for aim, group in itertools.groupby(cases, lambda case: case.aim):
         rows = []
-        for case in cases:
-            if case.aim == aim:
-                rows.append(summary(case, [GripTrial(**next(outcomes)) for _ in seeds]))
-                print(f"{case.name}: {rows[-1]['met']} of {trials}", file=sys.stderr, flush=True)
+        for case in group:
+            rows.append(summary(case, [GripTrial(**next(outcomes)) for _ in seeds]))
+            print(f"{case.name}: {rows[-1]['met']} of {trials}", file=sys.stderr, flush=True)
         missed = sum(row["met"] < trials for row in rows)
-        if rows:
-            note = f"  not met: {missed} of {len(rows)}"
-            reports.append(
-                Report(
-                    f"true force / commanded force: {aim}", rows, notes=(note,), failed=missed > 0
-                )
-            )
+        title, note = f"true force / commanded force: {aim}", f"  not met: {missed} of {len(rows)}"
+        reports.append(Report(title, rows, notes=(note,), failed=missed > 0))
     return reports
 
 
@@ -208,12 +202,12 @@ def trial(case: FaultCase, seed: int) -> GripTrial:
         loop.advance(_REST_TIME + chance.uniform(0.0, 0.02))
         if words and not case.before:
             watch, begin = grip.watched(case.force), state.t
-            grip.begin(words)
+            found.comes = grip.begin(words)
         if case.then:
             loop.advance(_REPEATED_LAG)
             watch.asked = case.then
             grip.command("grasp", force=case.then)
-        loop.advance(case.comes + _OBSERVATION_TIME)
+        loop.advance(found.comes + _OBSERVATION_TIME)
         found.settled = watch.settled() if state.mode in GRIPPING_MODES else math.nan
         found.peak, found.above, found.slid = watch.peak, watch.above, watch.slid
         found.end = state.fault_name or state.mode

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
-from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged
+from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged, must_hold
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
 # Three kinds of tips with an ideal sensor, and spring tips with each defective sensor.
@@ -129,8 +129,8 @@ def overloaded(
         grip.command("arm")
         loop.advance(0.1)
         grip.command("grasp", force=_FORCE)
-        if not grip.until("holding", _GRIP_TIMEOUT):
-            raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
+        grip.until("holding", _GRIP_TIMEOUT)
+        must_hold(state)
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
         for k in range(_LOAD_STEP_COUNT):
             grip.plant.load(push=standing * (k + 1) / _LOAD_STEP_COUNT)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import random
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,11 +19,10 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import Frame, Goal, Reading
+from softfinger.daemon.types import Frame, Goal, Reading, State
 
 Sections = Mapping[str, Mapping[str, Any]]
 
-HIL = Path(__file__).parents[2] / "config" / "hil.toml"
 SOLID: Sections = {  # tips of solid rubber
     "tip": {"physics": "solid"},
     "material": {"law": "constant", "modulus": 0.15e6},
@@ -33,7 +31,6 @@ SOLID: Sections = {  # tips of solid rubber
 SENSORS: dict[str, Sections] = {  # sensors with defects; the ideal sensor adds only noise
     name: load(Path(name)).model_dump(exclude_unset=True) for name in ("velostat", "capacitive")
 }
-SOFTFINGER = (sys.executable, "-m", "softfinger")
 _FRAME_COUNT = 16  # number of frames that are stored for each canned sensor
 
 
@@ -43,8 +40,7 @@ class RigError(SoftfingerError):
 
 def merged(sections: Sections, base: Sections) -> dict[str, dict[str, Any]]:
     """Return ``base`` updated with ``sections``."""
-    names = dict.fromkeys((*base, *sections))
-    return {name: {**base.get(name, {}), **sections.get(name, {})} for name in names}
+    return {k: {**base.get(k, {}), **sections.get(k, {})} for k in {**base, **sections}}
 
 
 @contextlib.contextmanager
@@ -80,12 +76,11 @@ def hold(daemon: Daemon) -> None:
         loop.advance(1.0)
         if loop.state.mode == "holding":
             break
-    must_hold(daemon)
+    must_hold(loop.state)
 
 
-def must_hold(daemon: Daemon) -> None:
+def must_hold(state: State) -> None:
     """Raise RigError unless the hand is holding an object."""
-    state = daemon.loop.state
     if state.mode != "holding":
         raise RigError(f"the hand failed to grip the object: {state.mode} {state.fault}")
 

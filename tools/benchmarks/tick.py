@@ -25,7 +25,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, attempt, figure, timed
-from softfinger.tools.benchmarks.rigs import HIL, can, hold, must_hold, virtual_daemon
+from softfinger.tools.benchmarks.rigs import can, hold, must_hold, virtual_daemon
 from softfinger.tools.processes.emulate import emulator_process
 
 _PRIORITY = 40  # SCHED_FIFO priority
@@ -55,7 +55,7 @@ def _simulated(title: str, seconds: int) -> Report:
             figure("a second on virtual time", "ms", 1e-3 * np.array(second), 50.0),
             figure("a tick", "µs", ticks(daemon, 2_000)),
         ]
-        must_hold(daemon)
+        must_hold(daemon.loop.state)
     return Report(title, rows)
 
 
@@ -83,8 +83,8 @@ def _in_turns(title: str, rounds: int) -> Report:
                     samples.setdefault(name, []).extend(turn())
                     share = (time.thread_time() - before) / (time.perf_counter() - began)
                     used[name] = used.get(name, 0.0) + share / rounds
-        must_hold(quiet)
-        must_hold(heard)
+        must_hold(quiet.loop.state)
+        must_hold(heard.loop.state)
     rows = [
         figure(name, "µs", found, None if "place" in name else 20.0)
         for name, found in samples.items()
@@ -128,8 +128,8 @@ def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) 
     back_to_back: list[float] = []
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        stack.enter_context(emulator_process("--dir", folder, "--config", HIL, "--baud", baud))
-        daemon = stack.enter_context(Daemon(load(HIL, folder, changes), wire=False))
+        stack.enter_context(emulator_process("--dir", folder, "--config", "hil", "--baud", baud))
+        daemon = stack.enter_context(Daemon(load(Path("hil"), folder, changes), wire=False))
         stack.enter_context(RealTime(daemon.settings))
         loop, clock, state = daemon.loop, daemon.clock, daemon.loop.state
         hold(daemon)
@@ -147,7 +147,7 @@ def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) 
                 clock.sleep_until(deadline)
                 in_place += timed(lambda: loop.tick(clock.now()))
             back_to_back += timed(cycle, _IN_TURN)
-        must_hold(daemon)
+        must_hold(daemon.loop.state)
         loop.command({"command": "stop"})
         loop.tick(clock.now())
     base = float(np.median(back_to_back))

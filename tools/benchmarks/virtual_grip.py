@@ -119,10 +119,12 @@ class VirtualGrip(SimulatedDaemon):
             self.loop.advance(self.loop.period)
         return self.state.mode == mode
 
-    def begin(self, words: str) -> None:
-        """Start faults given in `softfinger emulate --fault` syntax."""
-        for event in parse_faults(words.split(), ()):
+    def begin(self, words: str) -> float:
+        """Start faults in `softfinger emulate --fault` syntax; return how long they develop [s]."""
+        events = parse_faults(words.split(), ())
+        for event in events:
             self.plant.apply_fault(event._replace(after=self.state.t + event.after))
+        return max((event.over for event in events), default=0.0)
 
     def watched(self, asked: float) -> Watch:
         """Start recording each tick, and return the `Watch`."""

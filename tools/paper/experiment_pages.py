@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from softfinger.kinematics.contact.closed_form import closed_forms
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.quadrature import integrate
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.paper.model_pages import (
     DEPTHS,
     ENERGY,
+    FORCE,
     MILLI,
     MODULUS,
     TILTS,
@@ -32,7 +32,6 @@ from softfinger.tools.paper.model_pages import (
 from softfinger.tools.paper.sheets import (
     CIRCLE,
     DEPTH,
-    FORCE,
     RELATIVE,
     Erratum,
     FigurePage,
@@ -52,11 +51,6 @@ TILTED = -11.5  # angle between finger and object after the finger rotation [deg
 ROLLED = 9.2  # angle between finger and object after rolling by 20.7° [degrees]
 
 
-def _force(d: Numbers, theta: Numbers) -> FloatArray:
-    """Return F [N] for the paper's constant modulus; d is in mm and θ in degrees."""
-    return closed_forms(MODULUS, d * MILLI, np.radians(theta)).force
-
-
 def _force_table_i(d: Numbers, theta: Numbers) -> FloatArray:
     """Return F [N] for Table I's material law; d is in mm and θ in degrees."""
     return integrate(TIP, Material.table_i(), d * MILLI, np.radians(theta)).force
@@ -74,7 +68,7 @@ def compression() -> tuple[Sheet, ...]:
             for each in d
         ]
         columns |= {
-            f"F at {tilt} deg [N]": _force(d, theta),
+            f"F at {tilt} deg [N]": FORCE.closed(d, theta),
             f"F through the sensor at {tilt} deg [N]": np.array(sensed),
             f"F of Table I's law at {tilt} deg [N]": _force_table_i(d, theta),
         }
@@ -91,14 +85,14 @@ def _one_tilt(tilt: int, axes: Axes, numbers: Sheet) -> None:
 
 
 def _all_tilts(axes: Axes, numbers: Sheet) -> None:
-    for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
+    for tilt, style in ordered(TILTS):
         axes.plot(numbers["d"], numbers[f"F at {tilt} deg"], **style, label=f"{tilt}°")
 
 
 def _compression_panels() -> Iterator[Panel]:
     """Yield panels (a) to (g) with one angle each, and panel (h) with all angles."""
     for k, (letter, tilt) in enumerate(zip("abcdefg", TILTS, strict=True)):
-        labels = DEPTH if k >= 4 else "", "" if k % 4 else FORCE
+        labels = DEPTH if k >= 4 else "", "" if k % 4 else FORCE.axis
         place = "" if k else "upper left"
         yield Panel(partial(_one_tilt, tilt), *labels, f"({letter}) {tilt}°", legend=place)
     legend = {"loc": "upper left", "ncols": 2}
@@ -120,10 +114,10 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
         d = np.float64(deepest)
         first |= {
             f"d up to {deepest} mm [mm]": d * rise,
-            f"F, d up to {deepest} mm [N]": _force(d * rise, tilting),
-            f"F at d = {deepest} mm [N]": _force(d, tilting),
+            f"F, d up to {deepest} mm [N]": FORCE.closed(d * rise, tilting),
+            f"F at d = {deepest} mm [N]": FORCE.closed(d, tilting),
         }
-        force, law = _force(d, rolling), _force_table_i(d, rolling)
+        force, law = FORCE.closed(d, rolling), _force_table_i(d, rolling)
         # If the springs point towards the tip centre (Nguyen and Arimoto), N = πE d² at any tilt.
         radial = np.full(rolling.shape, math.pi * MODULUS * (d * MILLI) ** 2)
         second |= {
@@ -138,7 +132,7 @@ def tilt_and_roll() -> tuple[Sheet, ...]:
 
 def _rotation(axes: Axes, rotation: Sheet, _: Sheet) -> None:
     thin: dict[str, Any] = {"color": GREY, "linewidth": 0.7}
-    for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    for d, style in ordered(DEPTHS):
         axes.plot(
             rotation["theta"], rotation[f"F, d up to {d} mm"], **style, label=f"d up to {d} mm"
         )
@@ -150,7 +144,7 @@ def _rotation(axes: Axes, rotation: Sheet, _: Sheet) -> None:
 def _rolling(axes: Axes, _: Sheet, rolling: Sheet) -> None:
     theta = rolling["theta"]
     axes.plot(theta, rolling["F/F(0) at d = 4 mm"], color=INK, label="constant E, every d: 1/cos θ")
-    for d, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    for d, style in ordered(DEPTHS):
         if d in (DEPTHS[0], DEPTHS[-1]):
             law = rolling[f"F/F(0) of Table I's law at d = {d} mm"]
             axes.plot(theta, law, **style | {"linewidth": 1.1}, label=f"Table I's law, d = {d} mm")
@@ -277,7 +271,7 @@ PAGES = {
         (7.6, 4.3),
         tilt_and_roll,
         (
-            Panel(_rotation, RELATIVE, FORCE, "(a) the finger rotates", (0, TILTED), (0, 76),
+            Panel(_rotation, RELATIVE, FORCE.axis, "(a) the finger rotates", (0, TILTED), (0, 76),
                   "upper left"),
             Panel(_rolling, RELATIVE, "F(θ)/F(0) at equal d", "(b) then the object rolls by 20.7°",
                   (-24, 18), (0.9975, 1.038),

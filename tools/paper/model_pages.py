@@ -234,8 +234,8 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
         }
         row = {
             "theta [deg]": tilt,
-            "fitted exponent of d [1]": _power(d, integral),
-            "fitted exponent of d, Table I's law [1]": _power(d, value),
+            "fitted exponent of d [1]": exponent(d[_FITTED], integral[_FITTED]),
+            "fitted exponent of d, Table I's law [1]": exponent(d[_FITTED], value[_FITTED]),
             "fitted factor [1]": integral[-1] / power[-1],
             f"factor {quantity.prefactor} [1]": math.cos(math.radians(tilt))
             ** (1 - quantity.exponent),
@@ -244,9 +244,9 @@ def over_depth(name: str, quantity: Plotted) -> tuple[Sheet, ...]:
     return Sheet(name, columns), summary(f"{name}_exponents", rows)
 
 
-def _power(d: FloatArray, values: FloatArray) -> float:
-    """Fit a power law to ``values`` for d from 1 to 8 mm, and return its exponent."""
-    return float(np.polyfit(np.log(d[_FITTED]), np.log(values[_FITTED]), 1)[0])
+def exponent(d: FloatArray, values: FloatArray) -> float:
+    """Return ζ from a least-squares fit of ln ``values`` = ln C + ζ ln ``d``."""
+    return float(np.polyfit(np.log(d), np.log(values), 1)[0])
 
 
 def _key(axes: Axes, quantity: Plotted) -> None:
@@ -257,7 +257,7 @@ def _key(axes: Axes, quantity: Plotted) -> None:
 def _tilt_curves(quantity: Plotted, axes: Axes, numbers: Sheet, rates: Sheet) -> None:
     theta = numbers["theta"]
     rate = rates[f"d{quantity.symbol}/dtheta at {_STEEP_TILT} deg"]
-    for d, at, style in zip(DEPTHS, rate, ordered(len(DEPTHS)), strict=True):
+    for (d, style), at in zip(ordered(DEPTHS), rate, strict=True):
         closed = numbers[f"{quantity.symbol} at d = {d} mm"]
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at d = {d} mm"]
         label = f"d = {d} mm: {at:.1f} {quantity.unit}/rad at {_STEEP_TILT}°"
@@ -271,7 +271,7 @@ def _tilt_curves(quantity: Plotted, axes: Axes, numbers: Sheet, rates: Sheet) ->
 
 def _depth_curves(quantity: Plotted, axes: Axes, numbers: Sheet, _: Sheet) -> None:
     d = numbers["d"]
-    for tilt, style in zip(TILTS, ordered(len(TILTS)), strict=True):
+    for tilt, style in ordered(TILTS):
         integral = numbers[f"{quantity.symbol} by eq. {quantity.equation} at {tilt} deg"]
         axes.plot(d, numbers[f"{quantity.symbol} at {tilt} deg"], **style, label=f"{tilt}°")
         look = CIRCLE | {"ms": 3.5, "mec": style["color"], "clip_on": False}
@@ -286,7 +286,7 @@ def _exponents(quantity: Plotted, axes: Axes, numbers: Sheet, fitted: Sheet) -> 
     )
     axes.plot(d[10::10], numbers["exponent at 30 deg"][10::10], **CIRCLE | {"ms": 4, "mec": INK})
     power = fitted["fitted exponent of d, Table I's law"]
-    for tilt, fit, style in zip(TILTS, power, ordered(len(TILTS)), strict=True):
+    for (tilt, style), fit in zip(ordered(TILTS), power, strict=True):
         if tilt % 10 == 0:
             local = numbers[f"exponent of Table I's law at {tilt} deg"]
             axes.plot(d, local, **style, label=f"Table I, {tilt}°: {fit:.3f} from 1 to 8 mm")

@@ -19,11 +19,10 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.types import Contact
 from softfinger.tools.benchmarks.rigs import Sections, merged
-from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TILTS
+from softfinger.tools.paper.model_pages import DEPTHS, FORCE, MILLI, MODULUS, TILTS
 from softfinger.tools.paper.sheets import (
     DEPTH,
     DOT,
-    FORCE,
     RELATIVE,
     FigurePage,
     FloatArray,
@@ -246,7 +245,7 @@ def _deep_errors(run: Sheet, symbol: str) -> FloatArray:
 
 
 def _forces(axes: Axes, *sheets: Sheet) -> None:
-    for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
+    for (tilt, style), run in zip(ordered(TILTS), sheets, strict=False):
         axes.plot(run["d"], run["F"], **style, label=f"{tilt}°")
         axes.plot(run["d estimated"][::6], run["F estimated"][::6], **DOT)
     axes.plot([], [], **DOT, label="estimated from the frames")
@@ -254,7 +253,7 @@ def _forces(axes: Axes, *sheets: Sheet) -> None:
 
 def _errors(symbol: str, axes: Axes, *sheets: Sheet) -> None:
     axes.axhline(0.0, color=GREY, linewidth=0.7)
-    for tilt, style, run in zip(TILTS, ordered(len(TILTS)), sheets, strict=False):
+    for (tilt, style), run in zip(ordered(TILTS), sheets, strict=False):
         d, off = run["d"][run["d"] > _RELATIVE_D_MIN], _deep_errors(run, symbol)
         axes.plot(d, off, **style | {"linewidth": 0.9}, label=f"{tilt}°")
 
@@ -313,11 +312,8 @@ def _along(symbol: str, axes: Axes, rotation: Sheet, rolling: Sheet, _: Sheet) -
 
 
 def _over_upright(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
-    least = zip(
-        DEPTHS, minima["angle of the least U estimated"], minima["its standard error, U"],
-        ordered(len(DEPTHS)), strict=True,
-    )  # fmt: skip
-    for depth, angle, error, style in least:
+    angles, errors = minima["angle of the least U estimated"], minima["its standard error, U"]
+    for (depth, style), angle, error in zip(ordered(DEPTHS), angles, errors, strict=True):
         theta, model = rolling[f"theta at {depth} mm"], rolling[f"U at {depth} mm"]
         level = float(np.interp(0.0, theta, model))
         found = rolling[f"U estimated at {depth} mm"]
@@ -328,7 +324,7 @@ def _over_upright(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
 
 def _angle_errors(axes: Axes, _: Sheet, rolling: Sheet, minima: Sheet) -> None:
     axes.axhline(0.0, color=GREY, linewidth=0.7)
-    for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    for depth, style in ordered(DEPTHS):
         theta = rolling[f"theta at {depth} mm"]
         off = rolling[f"theta estimated at {depth} mm"] - theta
         axes.plot(theta, off, **style | {"linewidth": 0.9}, label=f"d = {depth} mm")
@@ -340,7 +336,7 @@ PAGES = {
         (7.6, 6.2),
         compression,
         (
-            Panel(_forces, DEPTH, FORCE, "(a) force", (0, 8.2), (0, 78), "upper left"),
+            Panel(_forces, DEPTH, FORCE.axis, "(a) force", (0, 8.2), (0, 78), "upper left"),
             _error_panel("F", "(b) force error", "estimate over model − 1 [%]", 5.0),
             _error_panel("d", "(c) displacement error", "estimate − truth [µm]", 75.0),
             _error_panel("theta", "(d) angle error", "estimate − truth [deg]", 0.5),
@@ -358,7 +354,7 @@ PAGES = {
         (7.6, 6.2),
         tilt_and_roll,
         (
-            Panel(partial(_along, "F"), RELATIVE, FORCE, "(a) force along the path", _PATH),
+            Panel(partial(_along, "F"), RELATIVE, FORCE.axis, "(a) force along the path", _PATH),
             Panel(partial(_along, "U"), RELATIVE, "elastic energy U [mJ]",
                   "(b) energy along the path", _PATH, None, "lower right"),
             Panel(_over_upright, RELATIVE, "U(θ)/U(0)", "(c) energy while rolling, over U(0)",

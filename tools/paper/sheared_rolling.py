@@ -144,7 +144,7 @@ def sheared_rolling() -> tuple[Sheet, ...]:
 def _curves(name: str, axes: Axes, model: Sheet, run: Sheet, *_: Sheet) -> None:
     theta = model["theta"]
     upright = float(np.interp(0.0, theta, model[f"{name}, 0%"]))
-    for share, style in zip(SHARES, ordered(len(SHARES)), strict=True):
+    for share, style in ordered(SHARES):
         ratio = model[f"{name}, {share:.0%}"] / upright
         axes.plot(theta, ratio, **style, label=f"{share:.0%} shear")
         where = angle_of_minimum(np.radians(theta), ratio)
@@ -154,7 +154,7 @@ def _curves(name: str, axes: Axes, model: Sheet, run: Sheet, *_: Sheet) -> None:
 
 def _minima(axes: Axes, _model: Sheet, _run: Sheet, minima: Sheet, felt: Sheet) -> None:
     axes.axhline(0.0, color=GREY, linewidth=0.7)
-    for depth, style in zip(DEPTHS, ordered(len(DEPTHS)), strict=True):
+    for depth, style in ordered(DEPTHS):
         rows = minima["d"] == depth
         axes.plot(
             minima["share"][rows], minima[f"least {_ENERGY}"][rows], **style, label=f"{depth} mm"

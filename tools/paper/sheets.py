@@ -19,11 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
-Columns = Mapping[str, Any]
 Ends = tuple[float, float]
 
 DEPTH = "displacement d [mm]"
-FORCE = "total elastic force F [N]"
 RELATIVE = "relative angle θ [deg]"
 CIRCLE: dict[str, Any] = {"marker": "o", "linestyle": "none", "mfc": "none"}
 DOT = CIRCLE | {"ms": 3, "mec": INK, "mew": 0.6}
@@ -38,7 +36,7 @@ class Sheet:
     """
 
     name: str
-    columns: Columns
+    columns: Mapping[str, Any]
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return the values in column ``name``; raise KeyError if the column does not exist."""

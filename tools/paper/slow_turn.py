@@ -19,6 +19,7 @@ by step; the solution does not involve time, mass or damping.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from functools import cache, partial
@@ -145,22 +146,16 @@ def gripped() -> Held:
         return held(q, np.array([0.0, _HAND.tips(q)[0, 1], 0.0]), None)
 
     first = met(solve(lambda x: met(x).unbalanced()[3:], np.array([0.15])))
-    return turned(np.zeros(1), first)[0]
+    return turned(first, 0.0)
 
 
-def turned(angles: FloatArray, start: Held) -> list[Held]:
-    """Return the quasi-static path from ``start`` through the object angles ``angles`` [rad]."""
-    path = [start]
-    for angle in angles:
+def turned(last: Held, angle: float) -> Held:
+    """Return the equilibrium at the object angle ``angle`` [rad], one step after ``last``."""
 
-        def pose(x: FloatArray, angle: float = angle, last: Held = path[-1]) -> Held:
-            return held(x[2:], np.array([x[0], x[1], angle]), last)
+    def pose(x: FloatArray) -> Held:
+        return held(x[2:], np.array([x[0], x[1], angle]), last)
 
-        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
-            return of(x).unbalanced()
-
-        path.append(pose(solve(residual, np.r_[path[-1].pose[:2], path[-1].q])))
-    return path[1:]
+    return pose(solve(lambda x: pose(x).unbalanced(), np.r_[last.pose[:2], last.q]))
 
 
 def potential(there: Held, start: Held) -> float:
@@ -169,34 +164,28 @@ def potential(there: Held, start: Held) -> float:
     return there.energy() - start.energy() - torque * float((there.q - start.q).sum())
 
 
-def valley(floor: Held, aside: FloatArray, start: Held) -> FloatArray:
-    """Return V at the object angle of ``floor`` plus each offset in ``aside`` [rad].
+def valley(floor: Held, angle: float, start: Held) -> float:
+    """Return V at the object angle ``angle`` [rad], or NaN if a tip would slip.
 
     V is minimised over all coordinates except the antisymmetric joint angle, which is taken from
-    ``floor``. The tips roll to each pose from ``start`` in one step. V is NaN where a tip would
-    slip.
+    ``floor``. The tips roll to the pose from ``start`` in one step.
     """
     antisymmetric = 0.5 * float(floor.q[0] - floor.q[1])
     torque = float(start.torques().mean())
-    found = np.full(aside.size, np.nan)
-    near = np.append(floor.pose[:2], floor.q.mean())
-    for k, more in enumerate(aside):
-        angle = float(floor.pose[2] + more)
 
-        def pose(x: FloatArray, angle: float = angle) -> Held:
-            q = np.array([x[2] + antisymmetric, x[2] - antisymmetric])
-            return held(q, np.array([x[0], x[1], angle]), start)
+    def pose(x: FloatArray) -> Held:
+        q = np.array([x[2] + antisymmetric, x[2] - antisymmetric])
+        return held(q, np.array([x[0], x[1], angle]), start)
 
-        def residual(x: FloatArray, of: Callable[[FloatArray], Held] = pose) -> FloatArray:
-            there = of(x)
-            closing = (there.torques().mean() - torque) / WIDTH
-            return np.append(there.unbalanced()[:2], closing)
+    def residual(x: FloatArray) -> FloatArray:
+        there = pose(x)
+        closing = (there.torques().mean() - torque) / WIDTH
+        return np.append(there.unbalanced()[:2], closing)
 
-        there = pose(solve(residual, near))
-        normal, _, tangential = there.gradient()
-        if (np.abs(tangential) < _FRICTION * normal).all():
-            found[k] = potential(there, start)
-    return found
+    there = pose(solve(residual, np.append(floor.pose[:2], floor.q.mean())))
+    normal, _, tangential = there.gradient()
+    sticks = (np.abs(tangential) < _FRICTION * normal).all()
+    return potential(there, start) if sticks else math.nan
 
 
 def swing() -> list[dict[str, float]]:
@@ -249,7 +238,7 @@ def slow_turn() -> tuple[Sheet, ...]:
     there = np.linspace(0.0, REACH, _STEPS + 1)[1:]
     back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
     start = gripped()
-    path = [start, *turned(np.r_[there, back], start)]
+    path = list(itertools.accumulate(np.r_[there, back], turned, initial=start))
     antisymmetric = np.array([0.5 * (each.q[0] - each.q[1]) for each in path])
     equations = {
         "angle [deg]": [math.degrees(each.pose[2]) for each in path],
@@ -258,11 +247,12 @@ def slow_turn() -> tuple[Sheet, ...]:
         "V [mJ]": [1e3 * potential(each, start) for each in path],
         "shear force [N]": [each.gradient()[2][0] for each in path],
     }
-    landscape: dict[str, FloatArray] = {}
+    landscape: dict[str, Any] = {}
     for each in ANTISYMMETRIC_ANGLES:
         floor = path[int(np.argmin(np.abs(antisymmetric - math.radians(each))))]
-        landscape[f"angle at {each} deg [deg]"] = np.degrees(floor.pose[2] + _SIDE_ANGLES)
-        landscape[f"V at {each} deg [mJ]"] = 1e3 * valley(floor, _SIDE_ANGLES, start)
+        angles = floor.pose[2] + _SIDE_ANGLES
+        landscape[f"angle at {each} deg [deg]"] = np.degrees(angles)
+        landscape[f"V at {each} deg [mJ]"] = [1e3 * valley(floor, a, start) for a in angles]
     return (
         Sheet("slow_turn_equations", equations),
         summary("slow_turn_plant", swing()),
@@ -271,15 +261,9 @@ def slow_turn() -> tuple[Sheet, ...]:
 
 
 def _landscape(axes: Axes, equations: Sheet, _: Sheet, land: Sheet) -> None:
-    for antisymmetric, look in zip(
-        ANTISYMMETRIC_ANGLES, ordered(len(ANTISYMMETRIC_ANGLES)), strict=True
-    ):
-        axes.plot(
-            land[f"angle at {antisymmetric} deg"],
-            land[f"V at {antisymmetric} deg"],
-            **look,
-            label=f"lean {antisymmetric}°",
-        )
+    for lean, look in ordered(ANTISYMMETRIC_ANGLES):
+        angle, v = land[f"angle at {lean} deg"], land[f"V at {lean} deg"]
+        axes.plot(angle, v, **look, label=f"lean {lean}°")
     axes.plot(equations["angle"], equations["V"], color=INK, lw=2.0, label="slow turn")
 
 

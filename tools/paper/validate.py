@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,15 +21,10 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
+from softfinger.tools.paper.model_pages import MODULUS, TIP, exponent
 from softfinger.tools.terminal.text_layout import plain_table, table_text
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-
-# Radius [m], modulus [Pa] and Poisson's ratio of the paper's tip.
-RADIUS, MODULUS, POISSON = 0.020, 0.304e6, 0.49
+POISSON = 0.49  # Poisson's ratio of the solid tips
 DEPTHS = np.linspace(0.001, 0.007, 25)  # m
 TILTS = np.radians(np.linspace(0.0, 20.0, 41))
 FIGURES = {"agree": "✓", "disagree": "✗", "unknown": "?"}
@@ -83,16 +78,11 @@ def between(quantity: str, low: float, high: float, source: str, ours: float, fo
     return PublishedValue(quantity, text, source, f"{shown[2]}{unit}", verdict, why)
 
 
-def exponent(d: FloatArray, force: FloatArray) -> float:
-    """Return ζ from a least-squares fit of ln F = ln C + ζ ln d."""
-    return float(np.polyfit(np.log(d), np.log(force), 1)[0])
-
-
 _LAWS = {
-    "springs": Fingertip(RADIUS),
-    "solid, bonded": Fingertip(RADIUS, "solid", POISSON, "bonded"),
-    "solid, lying": Fingertip(RADIUS, "solid", POISSON, "lying"),
-    "solid, bonded, sticking": Fingertip(RADIUS, "solid", POISSON, "bonded", "sticking"),
+    "springs": TIP,
+    "solid, bonded": Fingertip(TIP.radius, "solid", POISSON, "bonded"),
+    "solid, lying": Fingertip(TIP.radius, "solid", POISSON, "lying"),
+    "solid, bonded, sticking": Fingertip(TIP.radius, "solid", POISSON, "bonded", "sticking"),
 }
 
 
@@ -107,7 +97,7 @@ def _tips() -> Iterator[PublishedValue]:
         stiff = "with a constant modulus, ζ = 2 for every E" if law == "springs" else ""
         yield between(f"ζ of F = C d^ζ, 1 to 7 mm: {law}", 1.46, 1.88, f"silicone cores: {source}",
                       zeta, why=stiff)  # fmt: skip
-    radius = np.sqrt(2.0 * RADIUS * DEPTHS - DEPTHS**2)
+    radius = np.sqrt(2.0 * TIP.radius * DEPTHS - DEPTHS**2)
     yield between("γ of the contact radius, c N^γ: springs", 0.0, 1.0 / 3.0,
                   "Xydas & Kao, IJRR 18(9), 1999",
                   exponent(math.pi * MODULUS * DEPTHS**2, radius))  # fmt: skip
@@ -120,7 +110,7 @@ def _tips() -> Iterator[PublishedValue]:
         "the data contain only the pressure under the base, not on the face",
     )
     springs = _table("springs")
-    hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(RADIUS)
+    hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(TIP.radius)
     d = np.linspace(0.004, 0.0079, 3901)
     crossing = d[np.argmin(np.abs(springs(d, 0.0).force - hertz * d**1.5))]
     yield between("depth at which springs and Hertz (ν ½) have the same force", 6.4, 6.4,
