@@ -346,7 +346,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     """
     left = h.tip[0]
     right = h.tip[1]
-    arm1, arm2, turn1, turn2, slide, _, _ = motion_of(h)
+    arm1, arm2, turn1, turn2, slide, _, across = motion_of(h)
     # Before contact, the gap shrinks at the rate at which d grows during contact.
     if h.is_single:
         by1, by2 = arm1, arm2
@@ -379,7 +379,9 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
     h.mean[ANGLE] += rotation
     if dt > 0.0:
         rotation_error = MODEL_ERROR * rotation
-        closing_error = MODEL_ERROR * d_step1
+        # In a rotation, the fingers move in opposite directions, so their errors do not cancel.
+        apart = across + 2.0 * h.radius - h.mean[D] - h.mean[D + 1]
+        closing_error = MODEL_ERROR * math.hypot(d_step1, 0.5 * apart * rotation)
         sideways_error = MODEL_ERROR * (arm1 * step1 - arm2 * step2)
         samples = MODEL_ERROR_TIME / dt
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples

@@ -258,11 +258,12 @@ def test_turning_back_and_forth_does_not_change_the_force_of_a_solid_tip(make):
     daemon = make(**load(Path("solid")).model_dump(exclude={"loop"}))
     grasped(daemon, 10.0)
     daemon.loop.advance(1.0)
-    hand = daemon.hand
+    before = float(np.mean(daemon.hand.force))
+    assert before == pytest.approx(10.0, rel=0.05)
     for angle in (0.1, -0.1) * 4:
         command(daemon, "rotate", angle=angle)
         daemon.loop.advance(2.0)
-        assert float(np.mean(hand.force)) == pytest.approx(10.0, rel=0.05)
+        assert float(np.mean(daemon.hand.force)) == pytest.approx(before, rel=0.05)
 
 
 def test_unsuitable_profiles_of_a_solid_tip_are_refused():
