@@ -173,12 +173,12 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
     with hot(24.0, 45.0) as hand:
         assert hand.mode == Mode.HOLDING
         assert max(heat.sensed for heat in hand.plant.servo_heat) < LIMIT
-        assert hand.plant.force.min() > 5.0
         told = heat_events(hand)
         assert any("the grip force was reduced from 24.0 to" in text for _, text in told)
         assert {level for level, _ in told} == {"warning"}
         eased = hand.state.goal.force
-        assert eased < 22.0
+        assert 4.5 < eased < 22.0
+        assert hand.plant.force.mean() == pytest.approx(eased, rel=0.05)
         hand.command("grasp", force=24.0)  # Request 24 N again with hot servos.
         hand.run(1.0)
         assert hand.state.goal.force == pytest.approx(eased)
