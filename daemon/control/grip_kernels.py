@@ -233,8 +233,8 @@ def _force_limit(g: GripState, arm: float, free_torque: float, load: float) -> f
 
     The limit is the target force plus three margins. The margins cover the torque constant error,
     the joint friction and the torque ``load`` [N·m] that the detected load causes. ``arm`` is the
-    moment arm of the grip force [m], and ``free_torque`` is the joint torque during the approach
-    [N·m].
+    moment arm of the grip force [m], and ``free_torque`` is the maximum joint torque during the
+    approach [N·m].
     """
     force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * g.law.torque_error)
     friction = slip_monitor.coulomb_friction(g.slip, free_torque)
