@@ -14,7 +14,7 @@ define the symbols.
 load. The offset is measured when a hold begins, and again after the force or the angle has changed.
 A load detected during the previous hold is not part of the offset. The offset then follows r̄
 slowly, with a time constant of up to _SETTLING_TIME. While the joints are stationary, friction
-balances any change in the commanded torque, so the change is added to the offset immediately. The
+balances any change in the commanded torque, so the offset follows the change as fast as r̄ does. The
 offset stays within ±`friction` of its initial value. Because rubber relaxes, the lower end of the
 range is extended by _RELAXATION_SHARE of the tip moment.
 
@@ -44,7 +44,7 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.perception.grasp import GraspState
-from softfinger.daemon.perception.hand_state import OUTLIER_GATE
+from softfinger.daemon.perception.hand_state import GATE, OUTLIER_GATE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import GRIP_FRACTION
@@ -98,6 +98,7 @@ class SlipState(Record):
     torque: float  # mean torque of both joints on the previous tick [N·m]
     is_watched: bool  # True if the residual at the start of the hold is known
     offset: float  # residual without a load [N·m]
+    balanced_torque: float  # torque that friction balances, not yet part of `offset` [N·m]
     start_offset: float  # part of the initial offset that friction can't explain [N·m]
     deviation: float  # part of the residual that is attributed to a load [N·m]
     moment: float  # moment of the tip forces at the start of the hold [N·m]
@@ -145,6 +146,7 @@ def reset(s: SlipState) -> None:
     """
     s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
     s.friction = s.offset = s.start_offset = s.deviation = s.moment = s.holding_time = 0.0
+    s.balanced_torque = 0.0
     s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
@@ -172,6 +174,7 @@ def begin(s: SlipState, grasp: GraspState) -> None:
         s.start_offset = s.offset - clip(s.offset, s.friction)
     s.moment = moment
     s.rotation[:] = 0.0
+    s.balanced_torque = 0.0
     s.q[:] = grasp.q
     s.holding_time = _AVERAGE_TIME
 
@@ -357,7 +360,7 @@ def _has_jumped(
     sense = 1.0 - 2.0 * kind
     change = 0.5 * (changes[0] + sense * changes[1])
     smaller = min(changes[0] * change, sense * changes[1] * change)
-    noise = OUTLIER_GATE * math.sqrt(s.variance[kind])
+    noise = GATE * math.sqrt(s.variance[kind])
     released = s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
     if smaller <= _AGREEMENT * change * change or abs(change) <= noise + released:
         return False
@@ -426,7 +429,10 @@ def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_chan
         s.q[k] += (grasp.q[k] - s.q[k]) * law.dt / _SETTLING_TIME
         is_standing = is_standing and abs(grasp.q[k] - s.q[k]) < law.standstill
     if is_standing:
-        s.offset += torque_change
+        s.balanced_torque += torque_change
+    step = s.balanced_torque * law.dt / _AVERAGE_TIME  # The residual is averaged in the same way.
+    s.balanced_torque -= step
+    s.offset += step
     relaxation = _RELAXATION_SHARE * _moment(grasp)
     deviation = residual - s.offset
     if -s.friction - relaxation < deviation < s.friction:

@@ -329,12 +329,15 @@ class Control:
         self.grip.set_joint_stiffness(1.0 / compliance)
 
     def _change(self, state: Gripping) -> None:
-        """Leave the Settled state if the commanded force or angle has changed significantly."""
+        """Leave the Settled state if the commanded force or angle has changed significantly.
+
+        Any force command restarts the dither of the upright law, which also moves the joints.
+        """
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
-        if isinstance(state, Settled) and not (
-            abs(grip.commanded - force) < _FORCE_NOISE * force
-            and (math.isnan(grip.target_angle) or abs(grip.target_angle - angle) < _ANGLE_NOISE)
-        ):
+        same_force = abs(grip.commanded - force) < _FORCE_NOISE * force and not grip.is_dithering
+        off = abs(grip.target_angle - angle)
+        same_angle = math.isnan(grip.target_angle) or off < _ANGLE_NOISE
+        if isinstance(state, Settled) and not (same_force and same_angle):
             self._enter(Changing(state.history))
 
     # One tick

@@ -44,6 +44,7 @@ from softfinger.daemon.perception.hand_state import (
     interpolate,
     is_held,
     joint_angle,
+    latency_error,
     predicted_variance,
     reset,
     reset_all,
@@ -70,7 +71,6 @@ _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and 
 _WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass filter coefficient for ∂ ln F/∂d, applied on each frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
-_FIRST_D_ERROR = 0.5  # relative standard deviation of d in the first frames of a contact
 
 
 class FrameContact(NamedTuple):
@@ -92,6 +92,7 @@ class Scan(NamedTuple):
     d_rate: float  # at the scan [m/s]
     theta_rate: float  # at the scan [rad/s]
     spread: float  # variance of d during the response time of the cells [m²]
+    pending: float  # recent change in d, which the frame may not show yet [m]
     relaxation: float  # relaxation factor
 
 
@@ -100,6 +101,7 @@ class FingerMotion(NamedTuple):
 
     d: float
     spread: float
+    pending: float
     angle: float
     q: float
     relaxation: float
@@ -127,6 +129,7 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
     return FingerMotion(
         interpolate(first.d[finger], last.d[finger], fraction),
         interpolate(first.spread[finger], last.spread[finger], fraction),
+        interpolate(first.pending[finger], last.pending[finger], fraction),
         interpolate(first.angle, last.angle, fraction),
         interpolate(first.q[finger], last.q[finger], fraction),
         interpolate(first.relaxation[finger], last.relaxation[finger], fraction),
@@ -173,8 +176,22 @@ def _motion_since(
         d_rate,
         theta_rate,
         row.spread,
+        row.pending,
         row.relaxation,
     )
+
+
+@inner_kernel
+def _pending_variance(h: HandFilter, pending: float) -> float:
+    """Return the variance of d [m²] due to motion that a frame may not show yet.
+
+    The cells may respond more slowly than `tactile.response` specifies. A frame then lacks an
+    unknown part of ``pending``. Motion below the velocity resolution is ignored. All frames within
+    the error of the latency lack similar parts, so the variance is multiplied by their number.
+    """
+    resolution = h.velocity_unit * h.length * latency_error(h)
+    frame_count = max(h.frame_rate * latency_error(h), 1.0)
+    return max(abs(pending) - resolution, 0.0) ** 2 * frame_count
 
 
 @inner_kernel
@@ -236,7 +253,9 @@ def update(
     # Shortly after first contact, the cells still respond to motion that preceded the contact.
     cells_respond = h.t - tip.touch_time < h.response
     if is_new_contact or cells_respond:
-        reset(h, D + finger, d + scan.d, (_FIRST_D_ERROR * d) ** 2)
+        reset(h, D + finger, d + scan.d, h.radius * h.radius)  # Only the frame determines d.
+    pending_variance = _pending_variance(h, scan.pending)
+    d_noise += pending_variance
     d_at_scan = h.mean[D + finger] - scan.d
     angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - scan.rotation
     angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
@@ -273,7 +292,8 @@ def update(
         _set_d_slopes(h, finger, 1.0, 1.0, scan.d_rate)
         _update_footprint(h, finger, d_innovation, d_noise)
     if is_fitted and not h.gain_is_known and gain > 0.0:
-        _update_amplitude(h, finger, scan, (d, gain), covariance - systematic)
+        noise = covariance - systematic
+        _update_amplitude(h, finger, scan, (d, gain), noise, pending_variance)
     h.mean[D + finger] = max(h.mean[D + finger], D_MIN)
     return True
 
@@ -294,18 +314,25 @@ def _without_lag(
 
 @inner_kernel
 def _update_amplitude(
-    h: HandFilter, finger: int, scan: Scan, found: FloatPair, noise: FloatArray
+    h: HandFilter,
+    finger: int,
+    scan: Scan,
+    found: FloatPair,
+    noise: FloatArray,
+    pending_variance: float,
 ) -> None:
     """Update the state with the amplitude of a frame.
 
     ``found`` is (d, gain), and ``noise`` is the frame covariance without its systematic part. The
     errors of d and gain are correlated. The footprint update has already used the correlated part
-    of the errors. The amplitude update therefore uses only the uncorrelated part.
+    of the errors. The amplitude update therefore uses only the uncorrelated part. The relative
+    amplitude error due to pending motion is as large as the relative error of d.
     """
     d, gain = found
-    d_noise = noise[0, 0]
+    d_noise = noise[0, 0] + pending_variance
     ratio = noise[0, 3] / (d_noise * gain)
     own_noise = max(noise[3, 3] / (gain * gain) - ratio * ratio * d_noise, 0.0)
+    own_noise += pending_variance / (d * d)
     d_residual = d - (h.mean[D + finger] - scan.d + h.mean[D_BIAS + finger])
     innovation = math.log(gain) - ratio * d_residual
     innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]

@@ -88,6 +88,7 @@ class TrackedTip(Record):
     free_torque_max: Pair  # maximum |free_torque| in this window and in the previous window [N·m]
     window_start: float  # [s]
     travel: Pair  # accumulated predicted change in d [m] and in the joint angle [rad]
+    delayed_travel: float  # the change in d, low-pass filtered with the error of the latency [m]
     law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F
     relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered long-term forces [N]
     relaxation: float  # relaxation factor ρ, the ratio of tip force to long-term force
@@ -99,6 +100,7 @@ class HistoryRow(Record):
     t: float
     d: Pair
     spread: Pair  # variance of d during the response time of the cells [m²]
+    pending: Pair  # recent change in d, which a frame may not show yet [m]
     angle: float
     q: Pair
     relaxation: Pair
@@ -317,6 +319,7 @@ def predict(
 def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> None:
     """Low-pass filter the motion with the response time of the cells, and store the result."""
     smoothing = math.exp(-dt / h.response) if h.response > 0.0 else 0.0
+    delay_smoothing = math.exp(-dt / latency_error(h))
     last = history[h.newest_row]
     h.newest_row = (h.newest_row + 1) % len(history)
     row = history[h.newest_row]
@@ -327,8 +330,16 @@ def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> 
         row.d[k] = interpolate(tip.travel[0], last.d[k], smoothing)
         lag = tip.travel[0] - last.d[k]
         row.spread[k] = smoothing * (last.spread[k] + (1.0 - smoothing) * lag * lag)
+        tip.delayed_travel = interpolate(tip.travel[0], tip.delayed_travel, delay_smoothing)
+        row.pending[k] = tip.travel[0] - tip.delayed_travel
         row.q[k] = interpolate(tip.travel[1], last.q[k], smoothing)
         row.relaxation[k] = interpolate(tip.relaxation, last.relaxation[k], smoothing)
+
+
+@inner_kernel
+def latency_error(h: HandFilter) -> float:
+    """Return the standard deviation of `tactile.latency` [s]."""
+    return math.sqrt(h.prior_variance[LATENCY])
 
 
 @inner_kernel

@@ -124,7 +124,7 @@ ASKEW = {"object_angle": math.radians(5.0)}
         (control.LATE_LIMITS["two-phased, 0.5 Hz, 0 ms"], 0.0, 0.2),
         (control.LATE_LIMITS["two-phased, 0.5 Hz, 300 ms"], 0.0, 1.0),
         (control.LATE_LIMITS["energy, 0.5 Hz, 300 ms"], 0.0, 1.0),
-        (control.LATE_LIMITS["energy, 4 Hz, 0 ms"], 0.0, 0.2),
+        (control.LATE_LIMITS["energy, 4 Hz, 0 ms"], 0.0, 0.25),
         (control.LATE_LIMITS["energy, 4 Hz, 100 ms"], 5.0, 45.0),
         (control.LATE_LIMITS["two-phased, 4 Hz, 100 ms"], 5.0, 45.0),
         (control.LATE_TIPS["half as stiff along the face, 300 ms"], 0.0, 1.0),

@@ -248,7 +248,8 @@ def test_prediction_during_motion_is_within_its_own_uncertainty(sections):
             frames.append((alone.tilt_x - hand.plant.theta[0], miss[1]))
         share = np.sqrt(np.mean(np.square(off), axis=0))
         assert (share < 1.5).all(), share
-        assert (share > 0.2).all(), share
+        # During motion, d_std includes an unknown response time, which this sensor does not have.
+        assert (share > 0.15).all(), share
         # The tilts in the frames lag behind the plant, but the predicted tilts do not.
         old, new = np.abs(frames)[:150].mean(axis=0)
         assert new < 0.25 * old

@@ -196,6 +196,15 @@ def test_a_change_of_width_of_a_held_object_is_a_fault():
     assert judged(judge, state, 0.5) == ("", "")
 
 
+def test_a_force_estimate_that_is_too_high_for_one_frame_is_no_fault():
+    judge, state = safety(), sound()
+    put(state, {"contacts.1.force": 31.0})
+    for _ in range(20):  # 0.04 s
+        assert judge.judge(state) is None
+        later(state, 0.002)
+    assert judged(judge, state)[0] == "tip.force"
+
+
 STRONG = {"contacts.0.force": 27.5, "contacts.1.force": 27.5}
 WARNINGS: dict[str, tuple[Changes, str]] = {
     "hand.force": ({"contacts.0.force": 12.0}, "left 12.0 N, right 5.0 N"),

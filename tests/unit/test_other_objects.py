@@ -132,7 +132,7 @@ def test_a_small_disc_is_not_mistaken_for_another_tip():
 def test_a_disc_is_held_and_turned_by_the_line_between_its_contacts():
     with Rig({"simulation": {"object_shape": "disc"}}) as rig:
         rig.grasp(8.0)
-        assert rig.plant.force == pytest.approx([8.0, 8.0], rel=0.15)
+        assert rig.plant.force == pytest.approx([8.0, 8.0], rel=0.2)
         assert rig.state.contacts[0].d / rig.plant.d[0] == pytest.approx(0.72, abs=0.03)
         rig.turn(0.08, 2.0)
         assert rig.state.mode == "holding"

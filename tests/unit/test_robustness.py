@@ -89,7 +89,17 @@ def test_friction_and_a_weak_motor_do_not_leave_a_force_error(friction, torque, 
         grip.loop.advance(0.1)
         grip.command("grasp", force=force)
         assert grip.until("holding", 4.0)
-        assert grip.plant.force.min() > 0.89 * force
+        assert grip.plant.force.min() > 0.85 * force
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("seed", [33, 109, 275])
+def test_old_frames_and_slow_cells_do_not_change_the_force(seed):
+    """In these hands, frames are 20 to 40 ms older, and cells respond within 50 to 75 ms."""
+    found = grip(drawn(seed))
+    assert found.settled == pytest.approx(1.0, abs=0.12)
+    assert not found.raised
+    assert found.accused == ()
 
 
 def test_equal_seeds_give_equal_hands():

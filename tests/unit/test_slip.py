@@ -154,6 +154,18 @@ def at_rest(asked: float = FORCE) -> GripUnderLoad:
     return watched
 
 
+def test_torque_that_the_friction_of_stationary_joints_balances_is_not_a_load():
+    watched = at_rest()
+    for load in np.linspace(0.0, -4.0, 4000):  # The tips relax, so the torques decrease.
+        watched.run(load, 1)
+    state, load_arm = watched.grip._state, watched.held.load_arm
+    torque = state.torque[0]
+    watched.held.energy_arm = [0.01, 0.01]  # The controller increases the torques by 0.1 N·m.
+    for _ in range(100):
+        assert watched.run(-4.0 + (state.torque[0] - torque) / load_arm, 1) == FORCE
+        assert watched.grip.slip.load == 0.0
+
+
 GIVES_WAY = -0.024  # one velocity count [rad/s]
 
 
@@ -322,7 +334,7 @@ def test_a_sudden_lasting_push_across_the_faces_is_estimated_and_causes_no_fault
                 assert hand.mode == "holding"
                 assert hand.plant.force.max() < 30.0
                 found = [contact.force for contact in hand.loop.state.contacts]
-                assert found == pytest.approx(hand.plant.force, rel=0.2)
+                assert found == pytest.approx(hand.plant.force, rel=0.2, abs=1.0)
             assert not [kind for _, kind, _ in hand.events if kind.startswith("consistency.")]
 
 
