@@ -531,7 +531,7 @@ LIMITS += [
 # --- tips -----------------------------------------------------------------------------------------
 
 
-# After a blow, the first frame shows the object at its farthest displacement. The object springs back
+# After a blow, the first frame shows the object at its farthest position. The object springs back
 # before the next frame, so the estimated force is too high for one frame period (40 ms at 25 Hz).
 @Limit("tip.force", "normal force of a tip", "fault", ("safety.force_max",), "sensors",
     lasts=0.05, warn_at=_WARNING_FRACTION).each  # fmt: skip
