@@ -44,10 +44,10 @@ from softfinger.daemon.perception.hand_state import (
     interpolate,
     is_held,
     joint_angle,
-    latency_error,
     predicted_variance,
     reset,
     reset_all,
+    settling_time,
     shift_sideways,
 )
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
@@ -65,10 +65,6 @@ IMAGE_SHIFT_MIN = 0.06
 _JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
 _NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less force may rock
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
-# A footprint that grows within the response time of the cells appears wider and flatter. _WIDENING
-# and _FLATTENING are the relative changes in d and gain, divided by var(d)/d². Both constants were
-# computed by fitting a paraboloid to the mean of several paraboloids.
-_WIDENING, _FLATTENING, _SPREAD_MAX = 1.4, 2.0, 0.1
 _SLOPE_SMOOTHING = 0.9  # low-pass filter coefficient for ∂ ln F/∂d, applied on each frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
 
@@ -91,8 +87,7 @@ class Scan(NamedTuple):
     rotation: float  # object rotation since the scan [rad]
     d_rate: float  # at the scan [m/s]
     theta_rate: float  # at the scan [rad/s]
-    spread: float  # variance of d during the response time of the cells [m²]
-    pending: float  # recent change in d, which the frame may not show yet [m]
+    pending: float  # standard deviation of d due to recent motion [m]
     relaxation: float  # relaxation factor
 
 
@@ -100,7 +95,6 @@ class FingerMotion(NamedTuple):
     """Predicted motion of one finger, accumulated up to a given time."""
 
     d: float
-    spread: float
     pending: float
     angle: float
     q: float
@@ -128,7 +122,6 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
     last = history[after]
     return FingerMotion(
         interpolate(first.d[finger], last.d[finger], fraction),
-        interpolate(first.spread[finger], last.spread[finger], fraction),
         interpolate(first.pending[finger], last.pending[finger], fraction),
         interpolate(first.angle, last.angle, fraction),
         interpolate(first.q[finger], last.q[finger], fraction),
@@ -175,23 +168,9 @@ def _motion_since(
         h.rotation - row.angle,
         d_rate,
         theta_rate,
-        row.spread,
         row.pending,
         row.relaxation,
     )
-
-
-@inner_kernel
-def _pending_variance(h: HandFilter, pending: float) -> float:
-    """Return the variance of d [m²] due to motion that a frame may not show yet.
-
-    The cells may respond more slowly than `tactile.response` specifies. A frame then lacks an
-    unknown part of ``pending``. Motion below the velocity resolution is ignored. All frames within
-    the error of the latency lack similar parts, so the variance is multiplied by their number.
-    """
-    resolution = h.velocity_unit * h.length * latency_error(h)
-    frame_count = max(h.frame_rate * latency_error(h), 1.0)
-    return max(abs(pending) - resolution, 0.0) ** 2 * frame_count
 
 
 @inner_kernel
@@ -243,28 +222,23 @@ def update(
     tilt = total_tilt(found.theta, found.tilt_y)
     frame_force, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
     log_slope = stiffness / frame_force
-    d, gain = _without_lag(h, found, scan, is_fitted, log_slope)
+    d, gain = found.d, found.gain / scan.relaxation
+    if h.gain_is_known and not is_fitted:  # The amplitude determines d.
+        d -= math.log(scan.relaxation) / log_slope
     q = joint_angle(h, finger) - scan.q  # joint angle at the scan [rad]
     face = found.theta + sense * q  # face angle at the scan [rad]
     is_new_contact = not tip.in_contact
     if is_new_contact:
-        tip.touch_time = h.t
         _begin_contact(h, finger, sense, face + scan.rotation)
-    # Shortly after first contact, the cells still respond to motion that preceded the contact.
-    cells_respond = h.t - tip.touch_time < h.response
-    if is_new_contact or cells_respond:
         reset(h, D + finger, d + scan.d, h.radius * h.radius)  # Only the frame determines d.
-    pending_variance = _pending_variance(h, scan.pending)
+    # All frames within `settling_time` have similar errors, so they count as one measurement.
+    pending_variance = scan.pending * scan.pending * max(h.frame_rate * settling_time(h), 1.0)
     d_noise += pending_variance
     d_at_scan = h.mean[D + finger] - scan.d
     angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - scan.rotation
     angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
     d_innovation = d - (d_at_scan + h.mean[D_BIAS + finger])
-    if (
-        is_held(h)
-        and not cells_respond
-        and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN
-    ):
+    if is_held(h) and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN:
         jump = (angle_innovation, d_innovation if is_fitted else 0.0)
         if _is_rejected(h, finger, sense, scan, jump, (theta_noise, d_noise)):
             return False
@@ -276,7 +250,7 @@ def update(
     if tip.gain_is_fixed:  # Subtract the gain error, because the filter estimates the gain.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
-    tip.has_new_frame = not cells_respond
+    tip.has_new_frame = True
     _update_angle(h, finger, sense, angle_innovation, theta_noise, scan.theta_rate, is_new_contact)
     tip.in_contact = True
     if tip.gain_is_fixed:
@@ -296,20 +270,6 @@ def update(
         _update_amplitude(h, finger, scan, (d, gain), noise, pending_variance)
     h.mean[D + finger] = max(h.mean[D + finger], D_MIN)
     return True
-
-
-@inner_kernel
-def _without_lag(
-    h: HandFilter, found: FrameContact, scan: Scan, is_fitted: bool, log_slope: float
-) -> tuple[float, float]:
-    """Return d and gain, corrected for the cells' response time and the tip's relaxation."""
-    if is_fitted:
-        spread = min(scan.spread / (found.d * found.d), _SPREAD_MAX)
-        flattening = 1.0 - _FLATTENING * spread
-        return found.d / (1.0 + _WIDENING * spread), found.gain / (scan.relaxation * flattening)
-    if h.gain_is_known:
-        return found.d - math.log(scan.relaxation) / log_slope, found.gain
-    return found.d, found.gain
 
 
 @inner_kernel

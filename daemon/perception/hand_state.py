@@ -70,7 +70,6 @@ class TrackedTip(Record):
     """Per-finger data that is not part of the state vector."""
 
     in_contact: bool
-    touch_time: float  # time at which the contact began [s]
     has_new_frame: bool  # True if a frame has arrived since the last update with joint torques
     gain_is_fixed: bool  # True if the frames measure force × gain instead of displacement
     rejected_count: int  # number of consecutive rejected frames
@@ -88,7 +87,7 @@ class TrackedTip(Record):
     free_torque_max: Pair  # maximum |free_torque| in this window and in the previous window [N·m]
     window_start: float  # [s]
     travel: Pair  # accumulated predicted change in d [m] and in the joint angle [rad]
-    delayed_travel: float  # the change in d, low-pass filtered with the error of the latency [m]
+    delayed: Pair  # changes in d [m] and in the tilt [rad], low-pass filtered with `settling_time`
     law_error: Annotated[FloatArray, LAW_POINTS]  # relative error of F
     relaxation_state: Annotated[FloatArray, 3]  # low-pass filtered long-term forces [N]
     relaxation: float  # relaxation factor ρ, the ratio of tip force to long-term force
@@ -99,8 +98,7 @@ class HistoryRow(Record):
 
     t: float
     d: Pair
-    spread: Pair  # variance of d during the response time of the cells [m²]
-    pending: Pair  # recent change in d, which a frame may not show yet [m]
+    pending: Pair  # standard deviation of d in a frame due to recent motion [m]
     angle: float
     q: Pair
     relaxation: Pair
@@ -319,7 +317,7 @@ def predict(
 def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> None:
     """Low-pass filter the motion with the response time of the cells, and store the result."""
     smoothing = math.exp(-dt / h.response) if h.response > 0.0 else 0.0
-    delay_smoothing = math.exp(-dt / latency_error(h))
+    settling = math.exp(-dt / settling_time(h))
     last = history[h.newest_row]
     h.newest_row = (h.newest_row + 1) % len(history)
     row = history[h.newest_row]
@@ -328,18 +326,37 @@ def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> 
     for k in range(2):
         tip = h.tip[k]
         row.d[k] = interpolate(tip.travel[0], last.d[k], smoothing)
-        lag = tip.travel[0] - last.d[k]
-        row.spread[k] = smoothing * (last.spread[k] + (1.0 - smoothing) * lag * lag)
-        tip.delayed_travel = interpolate(tip.travel[0], tip.delayed_travel, delay_smoothing)
-        row.pending[k] = tip.travel[0] - tip.delayed_travel
+        tilt = h.rotation + (1.0 - 2.0 * k) * tip.travel[1]
+        tip.delayed[0] = interpolate(tip.travel[0], tip.delayed[0], settling)
+        tip.delayed[1] = interpolate(tilt, tip.delayed[1], settling)
+        row.pending[k] = _pending(h, tip.travel[0] - tip.delayed[0], tilt - tip.delayed[1])
         row.q[k] = interpolate(tip.travel[1], last.q[k], smoothing)
         row.relaxation[k] = interpolate(tip.relaxation, last.relaxation[k], smoothing)
 
 
 @inner_kernel
-def latency_error(h: HandFilter) -> float:
-    """Return the standard deviation of `tactile.latency` [s]."""
-    return math.sqrt(h.prior_variance[LATENCY])
+def settling_time(h: HandFilter) -> float:
+    """Return the time [s] within which the cells follow the pressure.
+
+    The cells may respond more slowly than `tactile.response` specifies. The unknown part is as
+    large as the error of `tactile.latency`.
+    """
+    settling: float = h.response + math.sqrt(h.prior_variance[LATENCY])
+    return settling
+
+
+@inner_kernel
+def _pending(h: HandFilter, closing: float, tilting: float) -> float:
+    """Return the standard deviation of d [m] in a frame due to motion within `settling_time`.
+
+    A frame may lack an unknown part of a change ``closing`` in d [m]. Changes below the velocity
+    resolution are ignored. If the tip rolls by ``tilting`` [rad], the pressure image smears by s =
+    R ``tilting``, where R is the tip radius. Its mean square radius, which is 2Rd/3 for a parabolic
+    pressure distribution, then increases by s². Therefore, d appears to be larger by 1.5 s²/R.
+    """
+    resolution = h.velocity_unit * h.length * settling_time(h)
+    smear = 1.5 * h.radius * tilting * tilting
+    return math.hypot(max(abs(closing) - resolution, 0.0), smear)
 
 
 @inner_kernel

@@ -125,16 +125,18 @@ ASKEW = {"object_angle": math.radians(5.0)}
         (control.LATE_LIMITS["two-phased, 0.5 Hz, 300 ms"], 0.0, 1.0),
         (control.LATE_LIMITS["energy, 0.5 Hz, 300 ms"], 0.0, 1.0),
         (control.LATE_LIMITS["energy, 4 Hz, 0 ms"], 0.0, 0.25),
-        (control.LATE_LIMITS["energy, 4 Hz, 100 ms"], 5.0, 45.0),
-        (control.LATE_LIMITS["two-phased, 4 Hz, 100 ms"], 5.0, 45.0),
+        (control.LATE_LIMITS["energy, 4 Hz, 100 ms"], 5.0, math.inf),
+        (control.LATE_LIMITS["two-phased, 4 Hz, 100 ms"], 5.0, math.inf),
         (control.LATE_TIPS["half as stiff along the face, 300 ms"], 0.0, 1.0),
         (control.LIMITS["torque constants 5 % apart"], 1.5, 3.0),
         (control.LIMITS["tips without tangential coupling"], 0.2, 1.2),
     ],
 )
 def test_residual_angle_error_of_a_control_law(way, low, high):
-    # The control loop is stable if the product of its delay and integral bandwidth is below π/2.
-    assert low <= control.left(way, ASKEW) <= high
+    # The control loop is stable if the product of its delay and integral bandwidth is below π/2. An
+    # unstable loop may drop the object.
+    left = control.left(way, ASKEW)
+    assert low <= (math.inf if left is None else left) <= high
 
 
 def test_an_object_that_is_not_held_is_counted_separately():
