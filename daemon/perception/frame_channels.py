@@ -231,8 +231,10 @@ def update(
     if is_new_contact:
         _begin_contact(h, finger, sense, face + scan.rotation)
         reset(h, D + finger, d + scan.d, h.radius * h.radius)  # Only the frame determines d.
-    # All frames within `settling_time` have similar errors, so they count as one measurement.
-    pending_variance = scan.pending * scan.pending * max(h.frame_rate * settling_time(h), 1.0)
+    pending_variance = 0.0
+    if is_fitted or h.gain_is_known:  # Otherwise, only frames during motion separate d and gain.
+        # All frames within `settling_time` have similar errors, so they count as one measurement.
+        pending_variance = scan.pending * scan.pending * max(h.frame_rate * settling_time(h), 1.0)
     d_noise += pending_variance
     d_at_scan = h.mean[D + finger] - scan.d
     angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - scan.rotation
