@@ -67,6 +67,7 @@ _NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less f
 _RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 _SLOPE_SMOOTHING = 0.9  # low-pass filter coefficient for ∂ ln F/∂d, applied on each frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
+_FIRST_D_ERROR = 0.5  # relative standard deviation of d at the touch if only the amplitude shows d
 
 
 class FrameContact(NamedTuple):
@@ -219,6 +220,7 @@ def update(
     sense = -1.0 if finger == 0 else 1.0
     scan = _motion_since(h, history, finger, t, sense)
     is_fitted = covariance[3, 3] > 0.0
+    shows_d = is_fitted or h.gain_is_known
     tilt = total_tilt(found.theta, found.tilt_y)
     frame_force, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
     log_slope = stiffness / frame_force
@@ -230,9 +232,10 @@ def update(
     is_new_contact = not tip.in_contact
     if is_new_contact:
         _begin_contact(h, finger, sense, face + scan.rotation)
-        reset(h, D + finger, d + scan.d, h.radius * h.radius)  # Only the frame determines d.
+        first_error = h.radius if shows_d else _FIRST_D_ERROR * d
+        reset(h, D + finger, d + scan.d, first_error * first_error)
     pending_variance = 0.0
-    if is_fitted or h.gain_is_known:  # Otherwise, only frames during motion separate d and gain.
+    if shows_d:  # Otherwise, only frames during motion separate d from the gain.
         # All frames within `settling_time` have similar errors, so they count as one measurement.
         pending_variance = scan.pending * scan.pending * max(h.frame_rate * settling_time(h), 1.0)
     d_noise += pending_variance
@@ -245,7 +248,7 @@ def update(
         if _is_rejected(h, finger, sense, scan, jump, (theta_noise, d_noise)):
             return False
     tip.tilt_y = found.tilt_y
-    tip.gain_is_fixed = not (is_fitted or h.gain_is_known)
+    tip.gain_is_fixed = not shows_d
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
