@@ -152,10 +152,12 @@ def test_a_replay_without_keys_stays_on_this_machine(address, reason):
 def test_late_subscribers_of_a_replay_receive_earlier_settings_and_events(addresses):
     told = {"schema": 1, "seq": 1, "again": False, "timestamp": 1.0, "mono_ns": 5, "settings": "{}"}
     event = {"schema": 1, "seq": 7, "again": False, "timestamp": 2.0, "text": "b"}
-    with Wire(addresses[0]) as wire, Hand(*addresses, timeout=60.0) as late:
-        wire.send(b"hand/settings", told)
-        wire.send(b"hand/event", event)
-        with late.events() as events:
+    with Wire(addresses[0]) as wire, Hand(*addresses, timeout=60.0) as hand:
+        with hand.events() as early:
             until(lambda: wire.subscribed(0.01))
-            again = events.next(60.0)
+            wire.send(b"hand/settings", told)
+            wire.send(b"hand/event", event)
+            assert not early.next(60.0).again
+        with hand.events() as late:
+            again = late.next(60.0)
     assert (again.seq, again.again, again.text) == (7, True, "b")
