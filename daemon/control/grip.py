@@ -66,7 +66,6 @@ class Grip:
         law.friction, law.driving = control.joint_friction, control.driving
         law.torque_error = control.torque_error
         law.friction_speed = control.friction_speed
-        law.torque_max = settings.safety.current_max * control.torque_constant
         law.turn_decay = math.exp(-2.0 * dt / control.smooth_time)
         law.is_blind = control.law == "upright"
         hand = settings.hand

@@ -41,7 +41,6 @@ class GripLaw(Record):
     friction: float  # joint friction [N·m]
     driving: float  # motor torque divided by tip torque while a joint closes
     friction_speed: float  # joint speed above which friction is fully compensated [rad/s]
-    torque_max: float  # [N·m]
     torque_error: float  # relative error of the torque constants
     turn_decay: float  # factor that reduces the rotation rate on each tick without a frame
     is_blind: bool  # True for the `upright` law, which uses dither instead of angle measurements
@@ -218,11 +217,8 @@ def _grip_force(g: GripState, target: float, measured: float, limit: float) -> f
     """Return the sum of ``target`` and the force feedback, but at most ``limit`` [N]."""
     law = g.law
     error = target - measured
-    # Anti-windup: do not increase the integral while a torque is at its limit.
-    full = abs(g.torque[0]) >= law.torque_max or abs(g.torque[1]) >= law.torque_max
-    if not full or error < 0.0:
-        integral = g.integral + law.force_bandwidth * error * law.dt
-        g.integral = clip(integral, max(limit - g.force.target, 0.0))
+    integral = g.integral + law.force_bandwidth * error * law.dt
+    g.integral = clip(integral, max(limit - g.force.target, 0.0))
     force: float = target + (law.force_gain * error + g.integral)
     return min(force, limit)
 

@@ -57,7 +57,6 @@ _SETTLING_TIME = 1.0  # settling time of the residual, and hold time of a force 
 _DECAY_TIME = 2.0  # time to reduce the force by `grip_raise_max`, and decay time of rotations [s]
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
 _ROTATION_INCREASE = 0.5  # relative force increase after the object has rotated
-_ROTATION_MARGIN = 1.5  # smallest significant rotation, as a multiple of the rotation due to shear
 _SHEAR_JUMP = 0.6  # smallest significant shear jump at solid tips [N]; equals 6 σ of the noise
 _AGREEMENT = 0.25  # minimum change at each joint or tip, as a fraction of the mean change
 _UNCONFIRMED_SHARE = 0.3  # maximum force increase without confirmation, as a fraction of the force
@@ -268,11 +267,7 @@ def _increased_force(s: SlipState, grasp: GraspState, commanded: float, sudden: 
     """Return the grip force [N] that the assumed load and the events of this tick require."""
     s.reflex_triggered = s.has_turned or sudden
     s.is_confirmed = s.is_confirmed or s.reflex_triggered
-    # If the object is pushed towards one finger, the force on that finger's tip increases. The
-    # joint torques show the push earlier than the tip forces do.
-    by_torque = abs(grasp.torque_residual[0] - grasp.torque_residual[1])
-    by_torque /= max(mean(grasp.moment_arm), s.law.arm_min)
-    imbalance = 0.5 * max(abs(grasp.force[0] - grasp.force[1]), by_torque)
+    imbalance = 0.5 * abs(grasp.force[0] - grasp.force[1])
     s.balanced_max = max(s.law.force_max - imbalance, commanded)
     s.force_limit = _force_limit(s, commanded, 0.5 * s.law.object_load / s.usable_friction)
     needed_force = s.assumed_load / s.usable_friction
@@ -317,7 +312,7 @@ def _detect_torque_jump(
     s: SlipState, grasp: GraspState, closing: float, dq: FloatPair, is_held: bool, sudden_min: float
 ) -> bool:
     """Average the residuals; return True if they show a sudden pull or twist."""
-    known_torque = closing * (s.friction if closing < 0.0 else s.law.joint_friction)
+    known_torque = closing * s.law.joint_friction
     change1 = grasp.torque_residual[0] - known_torque - s.residual[0]
     change2 = grasp.torque_residual[1] - known_torque - s.residual[1]
     sudden = is_held and (
@@ -351,8 +346,7 @@ def _has_jumped(
     tests exclude other causes:
 
     1. Both residuals change. A wrong current reading or a wrong frame affects only one joint.
-    2. The change exceeds the noise. The threshold is higher at the start of a hold, because the
-       joint friction may still change.
+    2. The change exceeds the noise.
     3. Both joints yield to the load.
     4. The load increases to a large fraction of the friction force. For this test, half of the load
        that joint friction may hide is added to the measured load.
@@ -361,8 +355,7 @@ def _has_jumped(
     change = 0.5 * (changes[0] + sense * changes[1])
     smaller = min(changes[0] * change, sense * changes[1] * change)
     noise = GATE * math.sqrt(s.variance[kind])
-    released = s.friction * (1.0 - s.holding_time / _SETTLING_TIME)
-    if smaller <= _AGREEMENT * change * change or abs(change) <= noise + released:
+    if smaller <= _AGREEMENT * change * change or abs(change) <= noise:
         return False
     sign = math.copysign(1.0, change)
     yield1 = sign * (s.speed[0] - dq[0])
@@ -415,9 +408,9 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
     # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. The
     # estimate then rises to |L| + `hidden` at |L| = `hidden`.
-    threshold = (1.5 - s.holding_time / _SETTLING_TIME) * hidden
+    ignored = 0.5 * hidden
     hidden = s.friction / max(slope, law.arm_min)
-    s.load = min(max(4.0 * (load - threshold), 0.0), load + hidden, law.friction * s.force_limit)
+    s.load = min(max(4.0 * (load - ignored), 0.0), load + hidden, law.friction * s.force_limit)
 
 
 @inner_kernel
@@ -454,7 +447,7 @@ def _has_turned(s: SlipState, grasp: GraspState) -> bool:
     agrees = min(s.rotation[0] * total, s.rotation[1] * total) > _AGREEMENT * total * total
     by_shear = 0.5 * s.law.friction * (grasp.d[0] + grasp.d[1]) / s.law.width
     noise = OUTLIER_GATE * grasp.angle_std
-    turned: bool = agrees and abs(total) > _ROTATION_MARGIN * by_shear + noise
+    turned: bool = agrees and abs(total) > by_shear + noise
     if turned:
         s.rotation[:] = 0.0
     return turned

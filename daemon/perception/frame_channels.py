@@ -392,11 +392,10 @@ def _is_rejected(
 
     ``jump`` contains the innovations of angle and d, and ``noise`` contains the noise variances.
     A jump in angle or displacement is an outlier unless the other tip or the joints confirm the
-    jump. A rotation is accepted if both tips show the rotation while the joints are moving. If the
-    joints are at rest, the rotation must also continue in the next frame. A displacement is
-    accepted if the joints are moving or if both tips are displaced. A blow displaces both tips,
-    because it presses the object into one tip and away from the other. The first frame of a real
-    jump is also rejected, because the other tip's frame has not arrived yet.
+    jump. A rotation is accepted if both tips show the rotation while the joints are moving. A
+    displacement is accepted if the joints are moving or if both tips are displaced. A blow
+    displaces both tips, because it presses the object into one tip and away from the other. The
+    first frame of a real jump is also rejected, because the other tip's frame has not arrived yet.
     """
     grasp = h.grasp
     tip = h.tip[finger]
@@ -412,12 +411,11 @@ def _is_rejected(
     d_jumps = abs(d) > max(IMAGE_SHIFT_MIN * h.radius, OUTLIER_GATE * d_std)
     # The threshold is two velocity units per joint.
     joints_move = abs(tip.speed) + abs(h.tip[other].speed) > 4.0 * h.velocity_unit
-    continues = tip.rejected_count > 0 and abs(angle - grasp.angle_jump[finger]) > IMAGE_SHIFT_MIN
     grasp.angle_jump[finger] = angle
     grasp.d_jump[finger] = d
     angle_agrees = angle * grasp.angle_jump[other] > _JUMP_SUPPORT * angle * angle
     d_agrees = abs(grasp.d_jump[other]) >= _JUMP_SUPPORT * abs(d)
-    is_rejected: bool = (angle_jumps and not (angle_agrees and (joints_move or continues))) or (
+    is_rejected: bool = (angle_jumps and not (angle_agrees and joints_move)) or (
         d_jumps and not (d_agrees or joints_move)
     )
     tip.rejected_count = tip.rejected_count + 1 if is_rejected else 0

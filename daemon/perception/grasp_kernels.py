@@ -121,16 +121,12 @@ def _set_torque_slopes(h: HandFilter) -> float:
 def _update_by_torques(h: HandFilter, dt: float) -> None:
     """Update the state with the mean closing torque and with the balance of the normal forces."""
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
-    h.torque_max = max(h.torque_max, torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
     if h.closing_speed > h.velocity_unit:  # Friction opposes the closing motion.
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
-        # When the torque decreases, gear friction may compensate for any part of the decrease.
-        held_torque = min(h.torque_max - torque, h.load_held * torque)
+        held_torque = h.load_held * torque  # torque that gear friction may balance
         variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
-        if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
-            h.covariance[FRICTION, FRICTION] += innovation * innovation  # A load has disappeared.
         correct(h, TORQUES, innovation, variance, GATE)
     h.slopes[:] = 0.0
     normal = h.grasp.normal

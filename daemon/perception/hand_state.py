@@ -137,7 +137,6 @@ class HandFilter(Record):
     rotation: float  # accumulated predicted rotation [rad]
     closing_speed: float  # mean closing speed of both joints [rad/s], low-pass filtered
     last_closing_speed: float  # value of `closing_speed` on the previous tick [rad/s]
-    torque_max: float  # maximum mean torque during this grip [N·m]
     balance_time: float  # time of the last update with joint torques and force balance [s]
     tip: Annotated[Records[TrackedTip], 2]
     grasp: GraspState
@@ -186,10 +185,6 @@ def correct(h: HandFilter, channel: int, innovation: float, variance: float, gat
             h.mean[i] += gain * innovation
             for j in range(STATES):
                 h.covariance[i, j] -= gain * h.scratch[j]
-        for k in (TORQUE, TORQUE + 1, LATENCY):  # barely observable states
-            bound = OUTLIER_GATE * math.sqrt(h.prior_variance[k])
-            error = h.mean[k] - h.prior_mean[k]
-            h.mean[k] = h.prior_mean[k] + min(max(error, -bound), bound)
         h.mean[LATENCY] = max(h.mean[LATENCY], -h.latency)
     h.slopes[:] = 0.0
 
@@ -208,7 +203,6 @@ def reset_all(h: HandFilter) -> None:
     """Reset all states to their priors."""
     for state in range(STATES):
         reset(h, state, h.prior_mean[state], h.prior_variance[state])
-    h.torque_max = 0.0
 
 
 # --- prediction -----------------------------------------------------------------------------------

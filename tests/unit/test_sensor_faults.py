@@ -68,6 +68,20 @@ def test_a_measurement_fault_is_named_and_has_no_effect(lie: str) -> None:
             assert any(kind == "tactile.silent" for _, kind, _ in hand.events)
 
 
+@pytest.mark.parametrize("over", [0.0, 2.0])
+def test_a_gain_change_at_one_solid_tip_is_named_and_has_no_effect(over):
+    """The frames of a solid tip measure only the product of force and gain."""
+    with Hand(SOLID) as hand:
+        grasped(hand, FORCE)
+        hand.plant.measurement_faults[0].begin("gain", 0.6, hand.plant.t, over)
+        seen = hand.watch(over + 2.0)
+        assert {kind for _, kind, _ in hand.events if kind.startswith("consistency")} == {
+            "consistency.left_sensor"
+        }
+        assert hand.mode == "holding"
+        assert seen.force == pytest.approx(FORCE, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("kind", "value", "force"),
     [("drift", -0.06, 5.0), ("replay", 0.41, 5.0), ("replay", 0.41, 8.0)],
