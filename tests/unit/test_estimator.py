@@ -119,6 +119,32 @@ def test_errors_reach_the_cramer_rao_bound(material, d, degrees, azimuth, percen
     )
 
 
+@pytest.mark.parametrize("material", [LINEAR, MEASURED], ids=["constant", "table_i"])
+@pytest.mark.parametrize("cells", [32, 16])
+@pytest.mark.parametrize(("d", "degrees"), [(0.001, 20.0), (0.006, 25.0), (0.008, 10.0)])
+def test_errors_on_coarser_grids_are_near_the_cramer_rao_bound(material, cells, d, degrees):
+    grid = SensorGrid(cells, cells, 44 * PITCH / cells, centre=(2e-4, -5e-4))
+    noise = 0.002 * material.reference_modulus
+    truth = (d, *tilts(math.radians(degrees), 0.8), 1.0)
+    sigma = np.sqrt(np.diag(fisher(grid, material, truth, noise, True)))
+    clean = grid.pressure(TIP, material, *truth[:3])
+    estimator = ContactEstimator(TIP, material, grid, noise)
+    rng = np.random.default_rng(3)
+    frames = 400
+    squares, nees = np.zeros(4), 0.0
+    for _ in range(frames):
+        found = estimator.update(clean + rng.normal(0.0, noise, grid.shape))
+        assert found.valid
+        miss = errors(found, truth)
+        squares += miss**2 / frames
+        nees += miss @ np.linalg.solve(found.covariance, miss) / (4.0 * frames)
+    assert np.all(np.sqrt(squares) < 1.2 * sigma), np.sqrt(squares) / sigma
+    assert 0.8 < nees < 1.3
+    estimator.state.options.tolerance = 1e-6
+    bias = errors(estimator(clean), truth)
+    assert np.all(np.abs(bias) < 0.25 * sigma), bias / sigma
+
+
 def test_a_rotated_oblong_sensor_gives_estimates_in_finger_axes():
     grid = SensorGrid(30, 50, (0.0012, 0.0017), centre=(0.001, -0.002), rotation=0.7)
     truth = (0.003, 0.25, -0.15, 1.0)

@@ -139,9 +139,9 @@ def frames_to_contacts(rounds: int) -> Report:
         return estimates(frames, tip=SOLID), truth, 15.0
 
     cases: dict[str, tuple[Callable[[], FloatArray], Truth | None, float | None]] = {
-        "ml: warm": (estimates(frames), TRUTH, 15.0),
+        "ml: warm": (estimates(frames), TRUTH, 20.0),
         "ml: cold": (estimates(frames, cold=True), TRUTH, 30.0),
-        "ml: at (8 mm, 30°), warm": (estimates(deep), _CORNER, 15.0),
+        "ml: at (8 mm, 30°), warm": (estimates(deep), _CORNER, 45.0),
         "solid: at 1 mm, warm": solid(_LIGHT),
         "solid: warm": solid(TRUTH),
         "solid: at (8 mm, 30°), warm": solid(_CORNER),
