@@ -134,9 +134,9 @@ def frames_to_contacts(rounds: int) -> Report:
     frames = GRID.pressure(TIP, LINEAR, *TRUTH) + NOISE * noise
     empty, deep = NOISE * noise, GRID.pressure(TIP, LINEAR, *_CORNER) + NOISE * noise
 
-    def solid(truth: Truth) -> tuple[Callable[[], FloatArray], Truth, float]:
+    def solid(truth: Truth) -> tuple[Callable[[], FloatArray], Truth, None]:
         frames = GRID.pressure(SOLID, LINEAR, *truth) + NOISE * noise
-        return estimates(frames, tip=SOLID), truth, 15.0
+        return estimates(frames, tip=SOLID), truth, None
 
     cases: dict[str, tuple[Callable[[], FloatArray], Truth | None, float | None]] = {
         "ml: warm": (estimates(frames), TRUTH, 20.0),
