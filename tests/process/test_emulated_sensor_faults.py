@@ -35,7 +35,8 @@ def running(hand: Sequence[str] = ()) -> Iterator[Rig]:
         text = made.config.read_text(encoding="utf-8").replace('loop.clock = "real"\n', "")
         made.config.write_text(text, encoding="utf-8")
         made.hand_words = tuple(word for each in hand for word in ("--set", each))
-        # The hand's clock does not pause while a busy machine delays the thread that reads frames.
+        # Measure times on the hand's clock. This clock does not pause while the thread that reads
+        # frames waits for a processor.
         patient = ("servos.fault_after=1.0", "safety.frame_age_fault=50")
         made.start(*(word for each in patient for word in ("--set", each)))
         yield made
