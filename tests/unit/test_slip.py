@@ -62,6 +62,23 @@ def test_the_grip_force_decreases_after_the_load_is_removed():
 
 
 @pytest.mark.parametrize(
+    ("push", "seed"),
+    [(13.0, 4), (13.5, 3), pytest.param(14.0, 5, marks=pytest.mark.extended)],
+)
+def test_a_load_that_disappears_while_the_fingers_close_leaves_no_force_increase(push, seed):
+    # The load is removed when the object is about to slip and the hand increases the force.
+    with Hand({"control": {"law": "upright"}, "simulation": {"seed": seed}}) as hand:
+        hand.grasp(FORCE)
+        hand.run(4.5)
+        push_along(hand, push, rate=11.0)
+        hand.plant.apply_load(0.0, 0.0)
+        hand.run(5.0)
+        assert hand.mode == "holding"
+        assert hand.state.goal.force == pytest.approx(FORCE, rel=0.01)
+        assert hand.plant.force.mean() == pytest.approx(FORCE, rel=0.1)
+
+
+@pytest.mark.parametrize(
     ("force", "sections"),
     [
         (10.0, {}),
