@@ -127,7 +127,7 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
         h.slopes[FRICTION] = 1.0
         held_torque = h.load_held * torque  # torque that gear friction may balance
         variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
-        # FRICTION includes the torque of a load. If the load disappears, FRICTION decreases suddenly.
+        # FRICTION includes the torque of a load. A load may disappear suddenly.
         if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
             h.covariance[FRICTION, FRICTION] += innovation * innovation
         correct(h, TORQUES, innovation, variance, GATE)

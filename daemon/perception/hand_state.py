@@ -298,11 +298,14 @@ def predict(
             h.tip[k].q = h.tip[k].encoder = q[k]
     h.last_closing_speed = h.closing_speed
     h.closing_speed += (0.5 * (dq[0] + dq[1]) - h.closing_speed) * min(dt / _VELOCITY_TIME, 1.0)
-    _move(h, dq, dt)
+    _move(h, (dq[0] * dt, dq[1] * dt), dt)
     if h.tip[0].in_contact or h.tip[1].in_contact:
         _add_process_noise(h, dt)
+    missing1 = _read_encoder(h, 0, q[0], abs(dq[0]) * dt)
+    missing2 = _read_encoder(h, 1, q[1], abs(dq[1]) * dt)
+    if missing1 != 0.0 or missing2 != 0.0:
+        _move(h, (missing1, missing2), 0.0)
     for k in range(2):
-        _read_encoder(h, k, q[k], abs(dq[k]) * dt)
         _relax(h, k, dt)
     _store(h, history, t, dt)
 
@@ -360,8 +363,8 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 
 
 @inner_kernel
-def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
-    """Advance the joints, tips and object at joint velocities ``dq`` [rad/s] for ``dt`` seconds.
+def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
+    """Advance the joints by ``step`` [rad] in ``dt`` seconds, and move the tips and the object.
 
     The object rotates by turn1 Δq1 − turn2 Δq2. Each displacement changes by half the change in d1
     + d2 (docs/estimation.md).
@@ -377,8 +380,7 @@ def _move(h: HandFilter, dq: FloatPair, dt: float) -> None:
         by2 = 0.5 * (arm2 - slide * turn2)
     if not (left.in_contact and right.in_contact):
         turn1 = turn2 = 0.0
-    step1 = dq[0] * dt
-    step2 = dq[1] * dt
+    step1, step2 = step
     d_step1 = by1 * step1
     d_step2 = by2 * step2
     if not h.is_single:
@@ -463,8 +465,11 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 
 
 @inner_kernel
-def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
+def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> float:
     """Update the state with the encoder angle.
+
+    Return the joint motion [rad] that the predicted motion still lacks, so that the joint stays
+    within the measured encoder count.
 
     The angle is known precisely only when the encoder count changes. Between two changes, the angle
     is uncertain by one count. ``step`` is the joint motion since the last reading [rad], computed
@@ -474,14 +479,15 @@ def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> None:
     found, spread = _encoder_measurement(h, finger, q, step)
     tip.encoder = q
     if spread == 0.0:
-        return
+        return 0.0
     h.slopes[ENCODER + finger] = 1.0
     innovation = found - joint_angle(h, finger)
     correct(h, ENCODER_CHANNEL + finger, innovation, spread * spread / 12.0, math.inf)
     tip.q += h.mean[ENCODER + finger]
     h.mean[ENCODER + finger] = 0.0
     if abs(q - tip.q) > 0.5 * h.encoder_resolution:
-        tip.q = _edge(h, q, q - tip.q)
+        return _edge(h, q, q - tip.q) - tip.q
+    return 0.0
 
 
 @inner_kernel

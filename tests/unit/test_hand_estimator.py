@@ -11,6 +11,7 @@ from softfinger.daemon.perception.hand_estimator import HandEstimator
 from softfinger.daemon.perception.hand_state import ENCODER, STATES, HandFilter, correct
 from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.servos.control_table import VELOCITY_UNIT
 from softfinger.daemon.types import Contact, Frame, Goal, ObjectPose, Reading
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.compiled.layout import Records
@@ -211,6 +212,26 @@ def test_an_encoder_edge_at_the_expected_angle_changes_no_estimate(estimator):
     estimator.predict(Reading(t=t, q=[q, 0.15], valid=True), Goal())
     estimator.write_contacts(t, contacts, pose)
     assert (contacts[0].theta, contacts[0].d, pose.angle) == pytest.approx(before, abs=1e-8)
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.52, 1.4])
+def test_d_follows_the_encoders_of_slow_joints(estimator, speed):
+    """Open both joints by 8 counts at ``speed`` velocity units; readings are whole units."""
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    count, start, dt = estimator._state.encoder_resolution, 0.15, 0.002
+    for k in range(20):
+        estimator.predict(Reading(t=5.0 + dt * k, q=[start] * 2, valid=True), Goal())
+        for finger in range(2):
+            estimator.update(finger, frame(5.0 + dt * k), ESTIMATE, contacts[finger])
+        estimator.write_contacts(5.0 + dt * k, contacts, pose)
+    first, arm = contacts[0].d, estimator.grasp.moment_arm[0]
+    dq = -round(speed) * VELOCITY_UNIT
+    for k in range(round(8.0 * count / (speed * VELOCITY_UNIT * dt))):
+        t, opened = 5.04 + dt * k, speed * VELOCITY_UNIT * dt * (k + 1)
+        q = round((start - opened) / count) * count
+        estimator.predict(Reading(t=t, q=[q, q], dq=[dq, dq], valid=True), Goal())
+        estimator.write_contacts(t, contacts, pose)
+        assert contacts[0].d == pytest.approx(first - arm * opened, abs=1.2 * arm * count)
 
 
 NO_CONTACT = replace(ESTIMATE, contact=False, d=0.0)

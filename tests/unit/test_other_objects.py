@@ -124,7 +124,7 @@ def test_a_declared_sheet_is_not_mistaken_for_a_missing_object():
 def test_a_small_disc_is_not_mistaken_for_another_tip():
     """A disc causes a misfit, which could change d by more than half."""
     with Rig({"simulation": {"object_shape": "disc", "object_radius": 0.010}}) as rig:
-        rig.grasp(8.0)
+        rig.grasp(8.0, 4.0)
         assert rig.state.mode == "holding"
         assert rig.contacts[0].misfit
 
