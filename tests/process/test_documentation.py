@@ -30,6 +30,7 @@ import pytest
 
 from softfinger.daemon.client.command_client import HandClient, send
 from softfinger.daemon.profile.load import find, load
+from softfinger.kinematics.compiled.own_folder import user_cache
 from tests.conftest import own_addresses
 from tests.harness.daemon_process import Running, plugin_path
 from tests.harness.documented import Softfinger, parse
@@ -89,10 +90,12 @@ class Shell:
         self._folder, self._softfinger = folder, softfinger
         self.log = folder / "shell.log"
         self._told, self._tell = os.pipe()
+        # The pages share the compiled kernels of this user.
+        own = {"HOME": str(folder), "XDG_CACHE_HOME": str(user_cache().parent)}
         with self.log.open("w") as log:
             self._process = subprocess.Popen(
                 ["bash", "--norc"], stdin=subprocess.PIPE, stdout=log, stderr=log, cwd=folder,
-                env=os.environ | {"HOME": str(folder)}, pass_fds=[self._tell], text=True,
+                env=os.environ | own, pass_fds=[self._tell], text=True,
             )  # fmt: skip
 
     def run(self, text: str) -> str:
