@@ -2,8 +2,9 @@
 
 The simulated hand and the daemon have separate settings. In each of the *rows*, one parameter
 differs from its setting by an amount that is typical of a healthy hand. In the *ensemble*, all
-parameters are drawn at random. Grips run in virtual time, so the results do not depend on the
-machine.
+parameters are drawn at random. If MuJoCo is installed, the first hands of the ensemble also grip an
+object in MuJoCo, without the stiction and relaxation that this plant does not simulate. Grips run
+in virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import math
 import random
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from importlib.util import find_spec
 from typing import Any
 
 from softfinger.daemon.control.modes import GRIPPING_MODES
@@ -23,7 +25,7 @@ from softfinger.tools.benchmarks.measuring import Report
 from softfinger.tools.benchmarks.rigs import Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch, diagnoses
 
-_TRIAL_COUNT, _HAND_COUNT = 20, 400
+_TRIAL_COUNT, _HAND_COUNT, _MUJOCO_COUNT = 20, 400, 100
 # Time limit for reaching the mode `holding`, undisturbed holding time, and observation time [s].
 _GRIP_TIMEOUT, _REST_TIME, _OBSERVATION_TIME = 8.0, 1.2, 6.0
 _ERROR_MAX, _ERROR_FAR = 0.2, 0.3  # limits for the relative force error
@@ -94,10 +96,11 @@ ROWS = (
     ),
 )
 
-_ENSEMBLE = "hand "
+_ENSEMBLE, _MUJOCO = "hand ", "mujoco "
 NAMES = (
     *(case.name for case in ROWS),
     *(f"{_ENSEMBLE}{seed}" for seed in range(1, _HAND_COUNT + 1)),
+    *(f"{_MUJOCO}{seed}" for seed in range(1, _MUJOCO_COUNT + 1) if find_spec("mujoco")),
 )
 
 
@@ -162,6 +165,21 @@ def drawn(seed: int) -> HandCase:
             if wrong or abs(drifts[side]) > 0.01
         ),
     )
+
+
+def drawn_in_mujoco(seed: int) -> HandCase:
+    """Create the same hand as `drawn` in MuJoCo, without stiction and relaxation."""
+    case = drawn(seed)
+    mujoco: Sections = {"servos": {"backend": "mujoco"}, "plugins": {"mujoco": {"timestep": 1e-3}}}
+    constant = case.torque * Settings().control.torque_constant
+    hand = merged(mujoco | {"control": {"torque_constant": constant}}, case.hand)
+    hand["simulation"] = {
+        key: value
+        for key, value in hand["simulation"].items()
+        if key not in ("joint_stribeck", "tip_relaxation")
+    }
+    daemon = merged(mujoco, case.daemon)
+    return replace(case, name=f"{_MUJOCO}{seed}", hand=hand, daemon=daemon, torque=1.0)
 
 
 @dataclass
@@ -241,11 +259,16 @@ def measure(
 ) -> list[Report]:
     """Return a table for the rows and a table for the ensemble; ``brief`` runs only a few cases."""
     trials = trials or (1 if brief else _TRIAL_COUNT)
-    count = 4 if brief else trials * _HAND_COUNT // _TRIAL_COUNT
-    hands = [case for case in map(drawn, range(1, count + 1)) if only in case.name]
+    share = 0.01 if brief else trials / _TRIAL_COUNT
     rows = [case for case in ROWS if only in case.name]
+    ensembles = [
+        [case for case in map(draw, range(1, round(share * count) + 1)) if only in case.name]
+        for draw, count in ((drawn, _HAND_COUNT), (drawn_in_mujoco, _MUJOCO_COUNT))
+        if draw is drawn or find_spec("mujoco")
+    ]
     seeds = range(1, trials + 1)
-    jobs = [(case, seed) for case in rows for seed in seeds] + [(hand, 1) for hand in hands]
+    jobs = [(case, seed) for case in rows for seed in seeds]
+    jobs += [(hand, 1) for hands in ensembles for hand in hands]
     outcomes = (Outcome(**each) for each in sweep(_outcome, jobs))
     reports = []
     if rows:
@@ -254,8 +277,9 @@ def measure(
         reports.append(
             Report("true force / commanded force, one difference per case", table, failed=failed)
         )
-    if hands:
-        reports.append(_ensemble(hands, [next(outcomes) for _ in hands]))
+    for title, hands in zip(("random hands", "random hands in MuJoCo"), ensembles, strict=False):
+        if hands:
+            reports.append(_ensemble(title, hands, [next(outcomes) for _ in hands]))
     return reports
 
 
@@ -278,7 +302,7 @@ def _row(case: HandCase, found: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _ensemble(hands: list[HandCase], found: list[Outcome]) -> Report:
+def _ensemble(title: str, hands: list[HandCase], found: list[Outcome]) -> Report:
     count = len(found)
 
     def share(what: str, aim: str, number: int, of: int = count) -> dict[str, Any]:
@@ -300,4 +324,4 @@ def _ensemble(hands: list[HandCase], found: list[Outcome]) -> Report:
         share("released", "", sum(math.isnan(each.settled) for each in found)),
         share("force increased without a load", "", sum(each.raised for each in found)),
     ]
-    return Report(f"{count} random hands", rows)
+    return Report(f"{count} {title}", rows)

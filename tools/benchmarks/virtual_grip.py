@@ -85,7 +85,8 @@ class VirtualGrip(SimulatedDaemon):
         """
         self.alarms: list[tuple[float, str]] = []  # time [s] and kind of each warning or error
         super().__init__(merged(daemon, {}), None if hand is None else merged(hand, {}))
-        self.plant.plant.parameters.torque_constant *= torque
+        if torque != 1.0:
+            self.plant.plant.parameters.torque_constant *= torque
         self.look: Callable[[], None] = lambda: None
         self.loop.heartbeat = lambda _: self.look()
         self.loop.advance(0.1)
