@@ -7,7 +7,8 @@ import pytest
 
 from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, grip
+from softfinger.tools.benchmarks.rigs import merged
+from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, drawn_in_mujoco, grip
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
 ROW = {case.name: case for case in ROWS}
@@ -100,6 +101,18 @@ def test_old_frames_and_slow_cells_do_not_change_the_force(seed):
     assert found.settled == pytest.approx(1.0, abs=0.12)
     assert not found.raised
     assert found.accused == ()
+
+
+@pytest.mark.extended
+def test_hands_of_the_ensemble_grip_in_mujoco():
+    pytest.importorskip("mujoco")
+    case = drawn_in_mujoco(3)
+    with VirtualGrip(case.daemon, merged(case.hand, case.daemon)) as hand:
+        hand.command("arm")
+        hand.loop.advance(0.1)
+        hand.command("grasp", force=case.force)
+        assert hand.until("holding", 4.0)
+        assert hand.plant.force.mean() == pytest.approx(case.force, rel=0.2)
 
 
 def test_equal_seeds_give_equal_hands():

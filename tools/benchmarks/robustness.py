@@ -172,7 +172,7 @@ def drawn_in_mujoco(seed: int) -> HandCase:
     case = drawn(seed)
     mujoco: Sections = {"servos": {"backend": "mujoco"}, "plugins": {"mujoco": {"timestep": 1e-3}}}
     constant = case.torque * Settings().control.torque_constant
-    hand = merged(mujoco | {"control": {"torque_constant": constant}}, case.hand)
+    hand = merged({"control": {"torque_constant": constant}}, merged(mujoco, case.hand))
     hand["simulation"] = {
         key: value
         for key, value in hand["simulation"].items()
