@@ -282,7 +282,6 @@ class TactileSettings(Section):
 class EstimatorSettings(Section):
     """Estimation of displacement and tilt from a frame."""
 
-    method: Literal["ml"] = setting("ml", "", "Estimation method: maximum likelihood.")
     free_gain: Literal["auto", True, False] = setting(
         "auto", "",
             "Estimate the sensor gain from each frame. `auto` estimates the gain for springs only, "
