@@ -98,7 +98,7 @@ def test_a_held_object_withstands_pushes_in_all_directions(sections, push):
 
 @pytest.mark.extended
 @pytest.mark.parametrize(
-    ("tip", "seconds", "error"), [({}, 150, 0.03), (SOLID, 120, 0.06)], ids=["springs", "solid"]
+    ("tip", "seconds", "error"), [({}, 120, 0.03), (SOLID, 120, 0.06)], ids=["springs", "solid"]
 )
 def test_the_force_does_not_drift_during_a_long_hold(tip, seconds, error):
     with watched(tip) as hand:
