@@ -2,7 +2,7 @@
 
 Channel   Measures                                                         Noise
 torque    mean of (1 + TORQUE) × tip force moment + FRICTION + inertia,    0.05 N·m and torque
-          while the joints close                                           held by the gears
+          in the first force ramp                                          held by the gears
 balance   N1 + PUSH = N2 as a ratio, where N are the normal forces         5 % and 0.4 N
 
 The force on a tip is ρ e^MODULUS F(D, θ). F is the tip's contact table, and ρ is the tip's
@@ -60,6 +60,7 @@ FloatArray = NDArray[np.float64]
 
 _SUPPORT_FRICTION = 0.4  # friction force between object and table [N]
 _D_BIAS_MIN = 0.1  # fraction of d
+_PAUSE_MAX = 0.3  # maximum time for which static friction stops a force ramp [s]
 
 
 class TipResult(NamedTuple):
@@ -122,14 +123,12 @@ def _update_by_torques(h: HandFilter, dt: float) -> None:
     """Update the state with the mean closing torque and with the balance of the normal forces."""
     torque = 0.5 * (h.tip[0].torque + h.tip[1].torque)
     innovation = torque - h.mean[FRICTION] - _set_torque_slopes(h)
-    if h.closing_speed > h.velocity_unit:  # Friction opposes the closing motion.
+    # Friction opposes the closing motion. After the first force ramp, loads may act, too.
+    if h.closing_speed > h.velocity_unit and h.rest_time < _PAUSE_MAX:
         innovation -= h.inertia * (h.closing_speed - h.last_closing_speed) / dt
         h.slopes[FRICTION] = 1.0
         held_torque = h.load_held * torque  # torque that gear friction may balance
         variance = TORQUE_NOISE * TORQUE_NOISE + held_torque * held_torque
-        # FRICTION includes the torque of a load. A load may disappear suddenly.
-        if innovation < -GATE * math.sqrt(predicted_variance(h) + variance):
-            h.covariance[FRICTION, FRICTION] += innovation * innovation
         correct(h, TORQUES, innovation, variance, GATE)
     h.slopes[:] = 0.0
     normal = h.grasp.normal

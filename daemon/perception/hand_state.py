@@ -137,6 +137,7 @@ class HandFilter(Record):
     rotation: float  # accumulated predicted rotation [rad]
     closing_speed: float  # mean closing speed of both joints [rad/s], low-pass filtered
     last_closing_speed: float  # value of `closing_speed` on the previous tick [rad/s]
+    rest_time: float  # time for which the joints of this grip have not closed [s]
     balance_time: float  # time of the last update with joint torques and force balance [s]
     tip: Annotated[Records[TrackedTip], 2]
     grasp: GraspState
@@ -203,6 +204,7 @@ def reset_all(h: HandFilter) -> None:
     """Reset all states to their priors."""
     for state in range(STATES):
         reset(h, state, h.prior_mean[state], h.prior_variance[state])
+    h.rest_time = 0.0
 
 
 # --- prediction -----------------------------------------------------------------------------------
@@ -460,6 +462,8 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
         _walk_d(h, _WALK_LOOSE_D, _WALK_LOOSE_D, dt)
         _walk(h, ANGLE, _WALK_LOOSE_ANGLE, dt)
     _walk(h, FRICTION, TORQUE_NOISE, dt)
+    if is_held(h) and h.closing_speed <= h.velocity_unit:
+        h.rest_time += dt
     for k in range(2):
         _walk(h, GAIN + k, _WALK_GAIN, dt)
 

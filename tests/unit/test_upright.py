@@ -133,7 +133,7 @@ def test_a_decreasing_grip_force_does_not_hold_the_dither_on_one_side():
         goal = hand._daemon.loop.state.goal
         assert goal.force > 1.05 * FORCE
         hand.plant.apply_load(0.0, 0.0)
-        hand.run(0.1)
+        hand.run(0.5)
         hand.command("grasp", force=FORCE)  # The force decreases a second later, during the dither.
         turned = np.abs(hand.watch(3.5).angle).max()
         assert hand.mode == "holding"
