@@ -60,7 +60,7 @@ FloatArray = NDArray[np.float64]
 
 _SUPPORT_FRICTION = 0.4  # friction force between object and table [N]
 _D_BIAS_MIN = 0.1  # fraction of d
-_PAUSE_MAX = 0.3  # maximum time for which static friction stops a force ramp [s]
+_PAUSE_MAX = 0.3  # total time without closing after which the first force ramp has ended [s]
 
 
 class TipResult(NamedTuple):
