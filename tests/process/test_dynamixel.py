@@ -3,6 +3,7 @@
 import math
 import struct
 import time
+from collections import deque
 
 import pytest
 
@@ -13,7 +14,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.protocol import ServoLine
-from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus, TimedReply
 from softfinger.daemon.types import Goal, Reading
 from tests.conftest import until
 from tests.harness.servos import RADIAN, backend_settings, lasting_notices, make_bus
@@ -190,26 +191,40 @@ def test_corrupted_replies_never_give_wrong_readings(running, kind, firmware, co
 
 
 @FIRMWARES
-def test_a_late_reply_is_not_used_for_the_next_request(running, firmware, connect):
+@pytest.mark.parametrize("lateness", [1, 4, 9])
+def test_a_late_reply_is_not_used_for_a_later_request(running, firmware, lateness, connect):
+    """The reply to each request arrives together with a later request."""
     bus = running(placed(firmware, 0, 0))
-    # Late replies take 0.01 s. On a busy machine, a reply may be late by several further timeouts.
-    # The request ten timeouts later has the same length again, so the timeout must not be short.
     backend = connect(bus, reply_timeout=0.008, zero=(0, 0))
+    reply, waiting = bus.bus.exchange, deque()
+
+    def reply_late(*request: object) -> list[TimedReply]:
+        waiting.append(reply(*request))
+        return waiting.popleft() if len(waiting) > lateness else []
+
+    def reply_to_all(*request: object) -> list[TimedReply]:
+        earlier = [each for replies in waiting for each in replies]
+        waiting.clear()
+        return earlier + reply(*request)
+
     reading = Reading()
 
-    def at_another_place(count: int) -> None:
-        """Move the joints to ``count``, and check that a reading does not show an earlier angle."""
+    def read_at_another_place() -> bool:
+        """Move the joints and read them; a valid reading must not show an earlier angle."""
+        count, served = reading.seq, bus.bus.packets
         bus.call(lambda: bus.bus.plant.q.__setitem__(slice(2), count * RADIAN))
         backend.read(reading)
-        if reading.valid:  # A reading may also be invalid if the system suspended this thread.
+        if reading.valid:
             assert reading.q == pytest.approx([count * RADIAN, -count * RADIAN])
+        until(lambda: bus.bus.packets > served)  # Requests must not wait in the port.
+        return reading.valid
 
-    bus.fault("late=1")
-    # On a busy machine, few replies count as late, so the loop may need many readings.
-    while backend.counters()["late"] <= 20 and reading.seq < 1000:
-        at_another_place(reading.seq)
-    bus.fault("late=0")
-    until(lambda: at_another_place(reading.seq) or reading.valid)
+    bus.call(lambda: setattr(bus.bus, "exchange", reply_late))
+    for _ in range(30):
+        assert not read_at_another_place()
+    assert backend.counters()["late"] >= 30 - lateness
+    bus.call(lambda: setattr(bus.bus, "exchange", reply_to_all))
+    until(read_at_another_place)
 
 
 def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
