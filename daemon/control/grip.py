@@ -63,7 +63,7 @@ class Grip:
         law.rotate_bandwidth = 2.0 * math.pi * control.rotate_bandwidth
         law.rotate_speed = control.rotate_speed
         law.damping = 2.0 * control.damping_ratio * math.sqrt(control.joint_inertia)
-        law.friction, law.driving = control.joint_friction, control.driving
+        law.joint_friction, law.driving = control.joint_friction, control.driving
         law.torque_error = control.torque_error
         law.friction_speed = control.friction_speed
         law.turn_decay = math.exp(-2.0 * dt / control.smooth_time)

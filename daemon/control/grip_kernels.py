@@ -38,7 +38,7 @@ class GripLaw(Record):
     rotate_bandwidth: float  # [rad/s]
     rotate_speed: float  # [rad/s]
     damping: float  # 2 ζ √J, the ratio of the damping [N·m·s/rad] to √stiffness
-    friction: float  # joint friction [N·m]
+    joint_friction: float  # [N·m]
     driving: float  # motor torque divided by tip torque while a joint closes
     friction_speed: float  # joint speed above which friction is fully compensated [rad/s]
     torque_error: float  # relative error of the torque constants
@@ -183,7 +183,7 @@ def single_torque(
         # The supported object can't move, so friction at the tip may balance part of the torque.
         q, law = grasp.q[finger], g.law
         reach = law.length * math.sin(q) + law.offset * math.cos(q) + law.radius
-        held_torque = g.slip.law.friction * g.force.target * max(reach, 0.0)
+        held_torque = g.slip.law.tip_friction * g.force.target * max(reach, 0.0)
         limit = _force_limit(g, arm, grasp.free_torque[finger], held_torque)
         g.grip_force = _grip_force(g, target, grasp.force[finger], limit)
         closing_rate = g.force.speed / (stiffness * arm)
@@ -378,4 +378,4 @@ def _motor_torque(law: GripLaw, torque: float, rate: float) -> float:
 @inner_kernel
 def _friction(law: GripLaw, rate: float) -> float:
     """Return the joint friction torque [N·m] at the commanded ``rate`` [rad/s]."""
-    return law.friction * clip(rate / law.friction_speed, 1.0)
+    return law.joint_friction * clip(rate / law.friction_speed, 1.0)

@@ -5,24 +5,27 @@ define the symbols.
 
     r         low-pass filtered torque residual of each joint; r̄ is the mean of both joints
     L         load per tip: r̄ − offset = load_arm L + load_curvature L²               (`load_of`)
-    load      min(4 max(|L| − friction/(2 load_arm), 0), |L| + friction/slope)
-    needed    max(load, solid-tip shear, object_load/2)/(tip_friction (1 − margin) − shear),
-              stored as `needed_force`
+    load      min(4 max(|L| − joint_friction/(2 load_arm), 0), |L| + joint_friction/slope), with
+              slope = load_arm + 2 load_curvature L
+    needed    max(load, pull, object_load/2)/usable_friction, stored as `needed_force`. `pull` is
+              the pulling force [N] that solid tips measure; usable_friction is tip_friction
+              (1 − margin) − `grasp.shear`, but at least _SPARE_MIN tip_friction.
     force     min(max(commanded, needed), force_limit)
 
 **Offset.** Gear friction, modulus errors and torque constant errors cause a residual even without a
 load. The offset is measured when a hold begins, and again after the force or the angle has changed.
 A load detected during the previous hold is not part of the offset. The offset then follows r̄
-slowly, with a time constant of up to _SETTLING_TIME. While the joints are stationary, friction
-balances any change in the commanded torque, so the offset follows the change as fast as r̄ does. The
-offset stays within ±`friction` of its initial value. Because rubber relaxes, the lower end of the
-range is extended by _RELAXATION_SHARE of the tip moment.
+slowly, with a time constant of up to _SETTLING_TIME. If the commanded torque of stationary joints
+changes, friction balances the change. The offset then follows the change with the time constant of
+r̄. Joint friction can explain an initial offset of up to ±`joint_friction`; `start_offset` is the
+part beyond this range. The offset stays within ±`joint_friction` of `start_offset`. Because rubber
+relaxes, the lower end of the range is extended by _RELAXATION_SHARE of the tip moment.
 
-**Load.** Friction hides loads of up to friction/load_arm, which is 2 N per tip for the built-in
-hand. Loads below half of friction/load_arm are ignored. The estimate of a larger load is increased
-by the load that friction may hide. An unconfirmed load increases the grip force by at most the
-fraction _UNCONFIRMED_SHARE. A load is confirmed when the object rotates, when both joints yield
-simultaneously, or when |L| exceeds 2 friction/load_arm.
+**Load.** Friction hides loads of up to joint_friction/load_arm, which is 2 N per tip for the
+built-in hand. Loads below half of this value are ignored. The estimate of a larger load is
+increased by the load that friction may hide. An unconfirmed load increases the grip force by at
+most the fraction _UNCONFIRMED_SHARE. A load is confirmed when the object rotates, when both joints
+yield simultaneously, or when |L| exceeds 2 joint_friction/load_arm.
 
 **Sudden events** increase the force immediately. The force increases to its limit if the torques
 jump by more than the noise while both joints yield. With solid tips, a jump in the measured shear
@@ -74,11 +77,11 @@ class SlipLaw(Record):
     yield_speed: float  # minimum speed change of a joint that yields to a load [rad/s]
     standstill: float  # maximum deviation of a stationary joint from its average angle [rad]
     force_max: float  # [N]
-    friction: float  # Coulomb friction coefficient between tip and object
+    tip_friction: float  # Coulomb friction coefficient between tip and object
     margin: float  # fraction of the friction coefficient that is reserved as a margin
-    joint_friction: float  # [N·m]
+    joint_friction: float  # `control.joint_friction` [N·m]
     friction_max: float  # maximum joint torque during an approach [N·m]
-    load_friction: float  # fraction of the tip moment that gear friction can balance
+    load_held: float  # fraction of the tip moment that gear friction can balance
     object_load: float  # [N]
     has_shear: bool  # True if the frames measure shear
     increase_max: float  # [N]
@@ -89,13 +92,13 @@ class SlipState(Record):
     """Estimated load, friction and force increase for one held object."""
 
     law: SlipLaw
-    friction: float  # joint friction, including the force-dependent part [N·m]
+    joint_friction: float  # joint friction, including the force-dependent part [N·m]
     residual: Pair  # average joint torque residuals [N·m]
     variance: Pair  # variances of the mean residual and of half the residual difference [N²·m²]
     speed: Pair  # average joint speeds [rad/s]
     q: Pair  # joint angles, averaged over _SETTLING_TIME [rad]
     torque: float  # mean torque of both joints on the previous tick [N·m]
-    is_watched: bool  # True if the residual at the start of the hold is known
+    is_watched: bool  # True if a load at the start of the hold would have changed the torques
     offset: float  # residual without a load [N·m]
     balanced_torque: float  # torque that friction balances, not yet part of `offset` [N·m]
     start_offset: float  # part of the initial offset that friction can't explain [N·m]
@@ -127,14 +130,14 @@ def configure(s: SlipState, settings: Settings) -> None:
     law.yield_speed = 0.5 * VELOCITY_UNIT / settings.servos.gear_ratio
     law.standstill = 2.0 * math.pi / (COUNTS_PER_TURN * settings.servos.gear_ratio)
     law.force_max = GRIP_FRACTION * settings.safety.force_max
-    law.friction, law.margin = control.tip_friction, control.slip_margin
+    law.tip_friction, law.margin = control.tip_friction, control.slip_margin
     law.joint_friction = control.joint_friction
     law.friction_max = control.approach_current * control.torque_constant
-    law.load_friction = control.load_held
+    law.load_held = control.load_held
     law.object_load = control.object_load
     law.has_shear = settings.tip.physics == "solid"
     law.increase_max, law.increase_ratio = control.grip_raise_max, control.grip_raise_share
-    s.usable_friction = max(1.0 - law.margin, _SPARE_MIN) * law.friction
+    s.usable_friction = max(1.0 - law.margin, _SPARE_MIN) * law.tip_friction
 
 
 @inner_kernel
@@ -144,7 +147,7 @@ def reset(s: SlipState) -> None:
     Call this kernel when the object is released or replaced.
     """
     s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
-    s.friction = s.offset = s.start_offset = s.deviation = s.moment = s.holding_time = 0.0
+    s.joint_friction = s.offset = s.start_offset = s.deviation = s.moment = s.holding_time = 0.0
     s.balanced_torque = 0.0
     s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
@@ -167,10 +170,10 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     if s.load > 0.0 and s.moment > 0.0:
         s.start_offset *= moment / s.moment
         off = mean(s.residual) - s.deviation - s.start_offset
-        s.offset = s.start_offset + clip(off, s.friction)
+        s.offset = s.start_offset + clip(off, s.joint_friction)
     else:
         s.offset = mean(s.residual)
-        s.start_offset = s.offset - clip(s.offset, s.friction)
+        s.start_offset = s.offset - clip(s.offset, s.joint_friction)
     s.moment = moment
     s.rotation[:] = 0.0
     s.balanced_torque = 0.0
@@ -227,7 +230,7 @@ def update(
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
     # Ignore the torques if joint friction could hide a load that is too large for the grip.
-    if law.friction * commanded * grasp.load_arm <= s.friction:
+    if law.tip_friction * commanded * grasp.load_arm <= s.joint_friction:
         s.load = 0.0
     if law.has_shear:  # Any load beyond the measured shear is due to a force error.
         s.load = min(s.load, pull + _SHEAR_JUMP)
@@ -245,10 +248,10 @@ def _update_friction(s: SlipState, grasp: GraspState) -> float:
     Rolling uses a part of the tip friction that increases with the grip force.
     """
     law = s.law
-    s.friction = coulomb_friction(s, mean(grasp.free_torque))
-    s.friction += law.load_friction * _moment(grasp)
-    spare_friction = law.friction * (1.0 - law.margin) - grasp.shear
-    s.usable_friction = max(spare_friction, _SPARE_MIN * law.friction)
+    s.joint_friction = coulomb_friction(s, mean(grasp.free_torque))
+    s.joint_friction += law.load_held * _moment(grasp)
+    spare_friction = law.tip_friction * (1.0 - law.margin) - grasp.shear
+    s.usable_friction = max(spare_friction, _SPARE_MIN * law.tip_friction)
     return spare_friction
 
 
@@ -361,12 +364,12 @@ def _has_jumped(
     yield1 = sign * (s.speed[0] - dq[0])
     yield2 = sense * sign * (s.speed[1] - dq[1])
     last = 0.5 * (s.residual[0] + sense * s.residual[1])
-    last -= s.offset if kind == 0 else clip(last, s.friction)
+    last -= s.offset if kind == 0 else clip(last, s.joint_friction)
     if min(yield1, yield2) <= s.law.yield_speed or abs(last + change) <= abs(last):
         return False
     curvature = grasp.load_curvature if kind == 0 else 0.0
     load, slope = load_of(last + change, grasp.load_arm, curvature)
-    hidden = s.friction / max(slope, s.law.arm_min)
+    hidden = s.joint_friction / max(slope, s.law.arm_min)
     has_jumped: bool = abs(load) + 0.5 * hidden > sudden_min
     return has_jumped
 
@@ -395,7 +398,9 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     smaller = 0.0
     if s.residual[0] * s.residual[1] > 0.0:
         smaller = min(abs(s.residual[0]), abs(s.residual[1]))
-    residual = clip(mean(s.residual), 2.0 * smaller + s.friction)  # A load acts on both joints.
+    residual = clip(
+        mean(s.residual), 2.0 * smaller + s.joint_friction
+    )  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     _update_offset(s, grasp, residual, torque_change)
     # If the residual changes because friction decreases or reverses, the change is not a load.
@@ -404,13 +409,13 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
     load, slope = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
-    hidden = s.friction / grasp.load_arm
+    hidden = s.joint_friction / grasp.load_arm
     s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
     # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. The
     # estimate then rises to |L| + `hidden` at |L| = `hidden`.
     ignored = 0.5 * hidden
-    hidden = s.friction / max(slope, law.arm_min)
-    s.load = min(max(4.0 * (load - ignored), 0.0), load + hidden, law.friction * s.force_limit)
+    hidden = s.joint_friction / max(slope, law.arm_min)
+    s.load = min(max(4.0 * (load - ignored), 0.0), load + hidden, law.tip_friction * s.force_limit)
 
 
 @inner_kernel
@@ -428,10 +433,10 @@ def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_chan
     s.offset += step
     relaxation = _RELAXATION_SHARE * _moment(grasp)
     deviation = residual - s.offset
-    if -s.friction - relaxation < deviation < s.friction:
+    if -s.joint_friction - relaxation < deviation < s.joint_friction:
         s.offset += deviation * law.dt / s.holding_time
-    lowest = s.start_offset - s.friction - relaxation
-    s.offset = min(max(s.offset, lowest), s.start_offset + s.friction)
+    lowest = s.start_offset - s.joint_friction - relaxation
+    s.offset = min(max(s.offset, lowest), s.start_offset + s.joint_friction)
 
 
 @inner_kernel
@@ -445,7 +450,7 @@ def _has_turned(s: SlipState, grasp: GraspState) -> bool:
         s.rotation[k] -= s.rotation[k] * s.law.dt / _DECAY_TIME
     total = s.rotation[0] + s.rotation[1]
     agrees = min(s.rotation[0] * total, s.rotation[1] * total) > _AGREEMENT * total * total
-    by_shear = 0.5 * s.law.friction * (grasp.d[0] + grasp.d[1]) / s.law.width
+    by_shear = 0.5 * s.law.tip_friction * (grasp.d[0] + grasp.d[1]) / s.law.width
     noise = OUTLIER_GATE * grasp.angle_std
     turned: bool = agrees and abs(total) > by_shear + noise
     if turned:

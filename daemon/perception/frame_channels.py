@@ -2,7 +2,7 @@
 
 Channel     Measures                                                   Noise
 angle       φ ∓ α/2 ± ENCODER + ANGLE_BIAS − θ̇ LATENCY                 frame covariance
-footprint   D + D_BIAS − ḋ LATENCY; with a fixed gain:                 frame covariance
+footprint   D + D_BIAS − ḋ LATENCY; with an unknown gain:              frame covariance
             ln F(D, θ) + MODULUS + GAIN − (∂ ln F/∂d) ḋ LATENCY
 amplitude   MODULUS + GAIN, if the gain was fitted                     2 %, frame covariance
 
@@ -248,17 +248,17 @@ def update(
         if _is_rejected(h, finger, sense, scan, jump, (theta_noise, d_noise)):
             return False
     tip.tilt_y = found.tilt_y
-    tip.gain_is_fixed = not shows_d
+    tip.gain_is_unknown = not shows_d
     tip.shear = found.shear
     tip.shared_variance[0] = systematic[0, 0]
     tip.shared_variance[1] = systematic[1, 1]
-    if tip.gain_is_fixed:  # Subtract the gain error, because the filter estimates the gain.
+    if tip.gain_is_unknown:  # Subtract the gain error, because the filter estimates the gain.
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = True
     _update_angle(h, finger, sense, angle_innovation, theta_noise, scan.theta_rate, is_new_contact)
     tip.in_contact = True
-    if tip.gain_is_fixed:
+    if tip.gain_is_unknown:
         expected, _, stiffness, _, _, _, _ = lookup(table, max(d_at_scan, D_MIN), tilt)
         smoothing = 0.0 if is_new_contact else _SLOPE_SMOOTHING
         tip.log_slope = interpolate(stiffness / expected, tip.log_slope, smoothing)
@@ -370,8 +370,8 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
     """Update the state with the footprint channel, whose derivatives are in `slopes`.
 
     If the innovations of the two tips have opposite signs, a large innovation means that the object
-    has been pushed sideways. If the signs are equal and the gain is fixed, a large innovation means
-    that the sensor gain has changed.
+    has been pushed sideways. If the signs are equal and the gain is unknown, a large innovation
+    means that the sensor gain has changed.
     """
     d_innovation = innovation / h.slopes[D + finger]
     other = h.tip[1 - finger].d_innovation
@@ -379,7 +379,7 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
     if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
         if d_innovation * other < 0.0:
             shift_sideways(h, min(abs(d_innovation), abs(other)) ** 2)
-        elif h.tip[finger].gain_is_fixed:
+        elif h.tip[finger].gain_is_unknown:
             h.covariance[GAIN + finger, GAIN + finger] += innovation * innovation
     correct(h, FOOTPRINT + finger, innovation, noise, GATE)
 

@@ -89,12 +89,12 @@ class GraspResult(NamedTuple):
 def _log_slope(h: HandFilter, finger: int) -> float:
     """Return ∂ ln F/∂d [1/m] for a tip.
 
-    If the gain is fixed, the slope of the footprint channel is returned. If two channels used
+    If the gain is unknown, the slope of the footprint channel is returned. If two channels used
     different slopes, unobservable directions of the state would appear observable.
     """
     tip = h.tip[finger]
     slope: float = tip.log_slope
-    if not tip.gain_is_fixed:
+    if not tip.gain_is_unknown:
         slope = h.grasp.stiffness[finger] / max(h.grasp.force[finger], 1e-3)
     return slope
 

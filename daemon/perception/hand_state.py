@@ -11,9 +11,10 @@ MODULUS         –      ln of tip modulus relative to the settings   (constant 
 GAIN            –      ln of sensor gain                            temperature
 TORQUE          –      torque constant in the settings over the     (constant in a grip)
                        true one, minus 1
-ANGLE, TAPER    rad    angle and taper of the object faces          rolling
+ANGLE           rad    angle of the object                          rolling
+TAPER           rad    angle between the object faces               (constant in a grip)
 LATENCY         s      frame age beyond `tactile.latency`           (constant in a grip)
-FRICTION        N·m    mean joint torque not explained by the       slow drift
+FRICTION        N·m    mean joint torque not explained by the       random walk
                        grip force
 PUSH            N      force on the object from left to right,      sudden sideways shift
                        across its faces
@@ -52,7 +53,7 @@ TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies wi
 
 # Random walks during a grip (per √s)
 _WALK_SIDEWAYS = 3e-4  # random walk of (d1 − d2)/2 [m]; the object can move between the tips
-_WALK_SIDEWAYS_FIXED_GAIN = 3e-5  # the same if frames measure only force × gain
+_WALK_SIDEWAYS_UNKNOWN_GAIN = 3e-5  # the same if frames measure only force × gain
 _WALK_LOOSE_D = 5e-3  # random walk of d for a contact without a grip [m]
 _WALK_LOOSE_ANGLE = 2e-2  # random walk of the angle for a contact without a grip [rad]
 _WALK_ANGLE = 2e-4  # random walk of the angle due to tip creep [rad]
@@ -71,7 +72,7 @@ class TrackedTip(Record):
 
     in_contact: bool
     has_new_frame: bool  # True if a frame has arrived since the last update with joint torques
-    gain_is_fixed: bool  # True if the frames measure force × gain instead of displacement
+    gain_is_unknown: bool  # True if the frames measure force × gain instead of displacement
     rejected_count: int  # number of consecutive rejected frames
     current_off_time: float  # time since the current began to differ from its goal [s]
     tilt_y: float  # [rad]
@@ -121,7 +122,7 @@ class HandFilter(Record):
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
     frame_rate: float  # `tactile.rate` [Hz]
-    frame_age_max: float  # maximum time for which a channel may be missing or wrong [s]
+    frame_age_max: float  # `safety.frame_age_fault` as a time [s]
     rejected_max: float  # maximum number of consecutive rejected frames
     response: float  # `tactile.response` [s]
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
@@ -250,9 +251,9 @@ def _walk_d(h: HandFilter, common: float, opposite: float, dt: float) -> None:
 def shift_sideways(h: HandFilter, variance: float) -> None:
     """Add process noise for a sideways shift of the object between the tips.
 
-    ``variance`` is the variance of the shift [m²]. A shift x changes d1 by x and d2 by −x. Only a
-    push can shift an object that a grip holds. The push equals the change in F2 − F1, which is −x
-    times the sum of the tip stiffnesses.
+    ``variance`` is the variance of the shift [m²]. A shift x towards the left tip changes d1 by x
+    and d2 by −x. Only a push can shift an object that a grip holds. The push equals the change in
+    F2 − F1, which is −x times the sum of the tip stiffnesses.
     """
     h.scratch[:] = 0.0
     h.scratch[D] = 1.0
@@ -451,8 +452,8 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
     if is_held(h):
         # The object has a constant width, so only the joints change d1 + d2.
         sideways = _WALK_SIDEWAYS
-        if h.tip[0].gain_is_fixed and h.tip[1].gain_is_fixed:
-            sideways = _WALK_SIDEWAYS_FIXED_GAIN
+        if h.tip[0].gain_is_unknown and h.tip[1].gain_is_unknown:
+            sideways = _WALK_SIDEWAYS_UNKNOWN_GAIN
         _walk_d(h, 0.0, 0.0 if h.is_single else sideways, dt)
         _walk(h, ANGLE, _WALK_ANGLE, dt)
         for k in range(2):
@@ -472,8 +473,8 @@ def _add_process_noise(h: HandFilter, dt: float) -> None:
 def _read_encoder(h: HandFilter, finger: int, q: float, step: float) -> float:
     """Update the state with the encoder angle.
 
-    Return the joint motion [rad] that the predicted motion still lacks, so that the joint stays
-    within the measured encoder count.
+    Return the correction [rad] that moves the tracked angle back into the measured encoder count,
+    or 0 if the tracked angle is within the count.
 
     The angle is known precisely only when the encoder count changes. Between two changes, the angle
     is uncertain by one count. ``step`` is the joint motion since the last reading [rad], computed

@@ -309,7 +309,7 @@ def test_friction_identified_during_the_approach_limits_load_detection():
             watched.run(load, 1)
         assert (watched.run(5.5, 100) > FORCE) == raised
         # The current of 0.15 A during the approach limits the torque.
-        assert watched.grip.slip.friction == pytest.approx(min(shown, 0.15 * 1.78))
+        assert watched.grip.slip.joint_friction == pytest.approx(min(shown, 0.15 * 1.78))
 
 
 def test_a_faulty_channel_cancels_the_force_increase_it_caused():
