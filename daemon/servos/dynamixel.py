@@ -79,8 +79,9 @@ class DynamixelServos:
         self._handler = PacketHandler()
         self._joints: list[Joint] = []
         self._port: SerialPort | None = None  # open port
-        self._torque: Torque | None = None  # None until the servos on the port have been checked
-        self._reads: TickReads | None = None
+        self._torque: Torque | None = None  # None while the port is closed
+        self._reads: TickReads | None = None  # None until the servos on the port have been checked
+        self._torque_may_be_on = False  # True if torque was not confirmed off on the last port
         self._turn = 0  # index of the most recently used span length
         self._varied_reads = 0  # remaining number of requests with varying span lengths
         self._next_health = self._next_check = -math.inf  # clock times of the next reads
@@ -93,15 +94,18 @@ class DynamixelServos:
     def connect(self) -> None:
         """Open or reopen the port and check every servo, without changing any register.
 
+        If this object has lost the port while torque was on, torque is first switched off.
+
         Raises
         ------
         ServoError
-            If problems were found; the message has one line per problem. The port is closed again.
+            If problems were found; the message has one line per problem. The port is closed again,
+            unless torque may be on. While the port is open, `torque_off` can be called.
         ServosSilent
             If the only problem is that servos do not respond. The port stays open for the next
             call, because reopening may restart an adapter that is still booting.
         """
-        if self._torque is not None:
+        if self._reads is not None:
             self.close()
         servos, profile = self._settings, self._profile
         model = by_name(servos.model)
@@ -116,18 +120,25 @@ class DynamixelServos:
             port.openPort()
             self._port = port
         line = ServoLine(self._port, self._handler)
+        self._torque = torque = Torque(line, model, servos, profile.hand, self._joints)
+        torque.may_be_on = self._torque_may_be_on
         try:
+            if torque.may_be_on:
+                torque.ask_off()
             self._reads = self._check(line, model)
         except ServosSilent:
             raise  # The port stays open.
-        except BaseException:
+        except PortLost:
             self.close()
+            raise
+        except BaseException:
+            if not torque.may_be_on:
+                self.close()
             raise
         more = len(self._joints) * (PRESENT[0] - CHECK[0]) * BITS_PER_BYTE / servos.baud
         self._check_interval = max(_CHECK_INTERVAL, more / _CHECK_FRACTION)
         self._varied_reads = 0
         self._next_health = self._next_check = -math.inf
-        self._torque = Torque(line, model, servos, profile.hand, self._joints)
 
     def _check(self, line: ServoLine, model: ServoModel) -> TickReads:
         """Check the servos, the adapter and the group reads, and store joint limits and notices."""
@@ -303,7 +314,7 @@ class DynamixelServos:
         ServoError
             If torque could not be switched on or verified. Torque may be on.
         """
-        if self._torque is None:
+        if self._torque is None or self._reads is None:
             raise ServoError("servos: not connected")
         self._torque.on()
 
@@ -319,15 +330,19 @@ class DynamixelServos:
         if torque is None:
             raise ServoError("servos: not connected")
         torque.ask_off()
-        found = self._exchange(ENABLED, reading)
-        if found is None:
-            return False
-        at = reg.TORQUE_ENABLE - found.start
-        if any(found.data[joint.id][at] for joint in self._joints):
-            return False
-        torque.confirmed_off()
-        reading.lost = 0
-        return True
+        if self._reads is None:  # `connect` has failed.
+            reading.valid = False
+            is_off = torque.is_off()
+        else:
+            found = self._exchange(ENABLED, reading)
+            is_off = found is not None and not any(
+                found.data[joint.id][reg.TORQUE_ENABLE - found.start] for joint in self._joints
+            )
+        if is_off:
+            torque.confirmed_off()
+            self._torque_may_be_on = False
+            reading.lost = 0
+        return is_off
 
     # --- closing ---------------------------------------------------------------------------------
 
@@ -367,6 +382,8 @@ class DynamixelServos:
             )
         except Exception as error:
             _log.error("servos: torque off was not confirmed: %s", error)
+        if torque is not None:
+            self._torque_may_be_on = torque.may_be_on
         port, self._port = self._port, None
         self._torque = self._reads = None
         if port is not None:

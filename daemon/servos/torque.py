@@ -114,6 +114,10 @@ class Torque:
             for group in self._offs:
                 group.send([b"\x00"] * len(group.ids))
 
+    def is_off(self) -> bool:
+        """Read the servos one by one; return True if each servo confirms that torque is off."""
+        return all(self._line.read(i, reg.TORQUE_ENABLE, 1) == b"\x00" for i in self._joints)
+
     def confirmed_off(self) -> None:
         """Disable the watchdogs after the servos have confirmed torque off."""
         if self.may_be_on:

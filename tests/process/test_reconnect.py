@@ -100,6 +100,31 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     rig.until(lambda: rig.torque() == [1, 1])
 
 
+@pytest.mark.parametrize(
+    ("fault", "responds", "mended", "refusal"),
+    [("silent=2", 0, "answer=2", "no reply"), ("overload=1", 1, "reboot=1", "hardware error")],
+)
+def test_torque_goes_off_although_the_servos_fail_the_checks_after_a_lost_port(
+    rig, fault, responds, mended, refusal
+):
+    loop = rig.loop
+    rig.does("arm")
+    rig.until(lambda: rig.torque() == [1, 1])
+    rig.unplug()
+    rig.until(lambda: loop.state.mode == "fault")
+    rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
+    assert rig.emulator.request(fault) == "ok"
+    rig.plug()
+    assert rig.torque()[1] == 1
+    rig.refuses("clear", refusal)
+    rig.until(lambda: rig.torque()[responds] == 0)
+    # The daemon repeats the request until every servo has confirmed it.
+    assert rig.emulator.request(mended) == "ok"
+    rig.until(lambda: rig.torque() == [0, 0] and not loop.state.torque)
+    rig.until(lambda: loop.state.t - loop.state.reading.t > rig.settings.servos.fault_after)
+    assert rig.does("clear")["mode"] == "disarmed"
+
+
 def test_clearing_another_fault_does_not_reopen_the_port(rig):
     rig.does("arm")
     assert rig.emulator.request("overload=1") == "ok"
