@@ -114,6 +114,8 @@ def _restore(
     if line.store(reg.TORQUE_ENABLE, {servo_id: b"\0"}):
         result.append(Finding("warn", name, "not restored: torque could not be switched off"))
         return
+    # After a watchdog stop, goals are read-only until 0 is written to the watchdog register.
+    line.store(reg.BUS_WATCHDOG, {servo_id: b"\0"})
     tables: list[bytes] = []
     # Write the operating mode first, because this write resets gains, profiles and goals.
     order = sorted(REGISTERS, key=lambda each: each.address != reg.OPERATING_MODE)

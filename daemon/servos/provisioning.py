@@ -344,6 +344,8 @@ def _set_up(line: ServoLine, settings: Settings, finger: int, model: ServoModel)
         if line.store(reg.TORQUE_ENABLE, {servo_id: b"\x00"}):
             return failed(_TORQUE_STAYS_ON)
         found.append(Finding("fixed", name, _TORQUE_OFF))
+    # After a watchdog stop, goals are read-only until 0 is written to the watchdog register.
+    line.store(reg.BUS_WATCHDOG, {servo_id: b"\x00"})
     rows = required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION])
     # Write the operating mode first, because this write resets gains, profiles and goals.
     for row in sorted(rows, key=lambda row: row.register.address != reg.OPERATING_MODE):
@@ -352,7 +354,9 @@ def _set_up(line: ServoLine, settings: Settings, finger: int, model: ServoModel)
         if wrong is None:
             continue
         what, value = row.register.name, row.mended(wrong)
-        if line.store(row.register.address, {servo_id: row.register.packed(value)}):
+        if value == wrong:  # Only a change of the settings can correct this register.
+            found.append(Finding("warn", name, row.told(wrong)))
+        elif line.store(row.register.address, {servo_id: row.register.packed(value)}):
             found.append(Finding("warn", name, f"{what} {wrong} could not be set to {value}"))
         else:
             found.append(Finding("fixed", name, f"{what} {wrong} → {value}", row.then))
@@ -363,44 +367,41 @@ def _set_up(line: ServoLine, settings: Settings, finger: int, model: ServoModel)
 def _reboot_if_needed(
     line: ServoLine, settings: Settings, finger: int, model: ServoModel
 ) -> Finding | None:
-    """Reboot a servo that has a hardware error or has lost a turn.
+    """Reboot a servo that has a hardware error or has lost a turn, and check it again.
 
     The caller must correct the servo's limits before the reboot.
     """
     servo_id = settings.servos.ids[finger]
     name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
+
+    def reason(table: Registers) -> str:
+        if error := table[reg.HARDWARE_ERROR_STATUS]:
+            return f"hardware error: {reg.hardware_error_names(error)}"
+        misplaced = check_position(name, scale, table, settings.hand, finger)
+        if misplaced is None or misplaced.fix != LOST_TURN_FIX:
+            return ""
+        return f"position wrong by at least one turn: {table.long(reg.PRESENT_POSITION)} counts"
+
     table = Registers.read(line, servo_id)
     if not table:
         return Finding("warn", name, "the registers could not be read")
-    misplaced = check_position(name, scale, table, settings.hand, finger)
-    if error := table[reg.HARDWARE_ERROR_STATUS]:
-        why = f"it had a hardware error: {reg.hardware_error_names(error)}"
-    elif misplaced is not None and misplaced.fix == LOST_TURN_FIX:
-        why = (
-            f"the position was wrong by at least one turn: {table.long(reg.PRESENT_POSITION)} "
-            "counts"
-        )
-    else:
+    if not (why := reason(table)):
         return None
-    match _reboot(line, servo_id):
-        case None:
-            problem = f"no reply after a reboot, which was necessary because {why}"
-            return Finding("warn", name, problem)
-        case 0:
-            return Finding("fixed", name, f"rebooted because {why}")
-        case error:
-            names = reg.hardware_error_names(error)
-            problem = f"it still reports a hardware error after a reboot: {names}"
-            return Finding("warn", name, problem, "remove the cause, and run the command again")
+    table = _reboot(line, servo_id)
+    if not table:
+        return Finding("warn", name, f"no reply after a reboot ({why})")
+    if still := reason(table):
+        fix = "remove the cause, and run the command again"
+        return Finding("warn", name, f"{still}, even after a reboot", fix)
+    return Finding("fixed", name, f"rebooted ({why})")
 
 
-def _reboot(line: ServoLine, servo_id: int) -> int | None:
-    """Reboot a servo and return its hardware errors, or None if it does not reply in time."""
+def _reboot(line: ServoLine, servo_id: int) -> Registers:
+    """Reboot a servo and return its registers, or an empty object if it does not reply in time."""
     line.handler.reboot(line.port, servo_id)
     end = time.monotonic() + _REBOOT_TIMEOUT
     while time.monotonic() < end:
         # A ping without a reply waits for its deadline, so this loop does not need its own pause.
         if line.ping(servo_id, tries=1) is not None:
-            status = line.read(servo_id, reg.HARDWARE_ERROR_STATUS, 1)
-            return status[0] if status else None
-    return None
+            return Registers.read(line, servo_id)
+    return Registers()

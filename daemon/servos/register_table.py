@@ -209,13 +209,6 @@ def required_registers(
             ),
             "warn",
         ),
-        Requirement(
-            _AT[reg.STATUS_RETURN_LEVEL],
-            lambda found: found > 0,
-            lambda _: 2,
-            lambda _: "status return level is 0, so the servo does not reply to reads",
-            "FAIL",
-        ),
     ]
     if mode in model.modes:
         told = reg.MODE_NAMES

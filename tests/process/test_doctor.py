@@ -118,7 +118,11 @@ def test_registers_are_stored_before_a_change_and_restored(hands, capsys, tmp_pa
     assert status == 0, lines
     assert f"note   servo 1 (left): 29 registers saved to {path}" in lines
     assert [memory[: reg.RAM] for memory in hand.registers()] != before
+    for servo in hand.emulator._servos.bus.servos:
+        servo.table.set(reg.GOAL_PWM, 500)
+        servo.table.set(reg.BUS_WATCHDOG, 255)  # The watchdog has stopped the servo.
     status, lines = hand.doctor(capsys, "--restore", str(path))
+    assert "servo 1 (left): goal PWM 500 → 885" in with_status(lines, "fixed")
     assert "servo 1 (left): operating mode 5 → 3" in with_status(lines, "fixed")
     assert [memory[: reg.RAM] for memory in hand.registers()] == before
     status, lines = hand.doctor(capsys, "--restore", str(tmp_path / "none.json"))

@@ -211,7 +211,7 @@ def test_extra_turns_of_the_position_are_removed_by_a_reboot(bus, connect):
         == "reboot the servo: switch its supply off and on again, or run `softfinger doctor --fix`"
     )
     (fixed,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
-    assert "rebooted because the position was wrong by at least one turn" in fixed.text
+    assert "rebooted (position wrong by at least one turn" in fixed.text
     assert [each.status for each in told(bus)] == ["pass"]
 
 
@@ -223,7 +223,7 @@ def test_an_error_that_a_wrong_limit_causes_is_corrected_with_the_limit(bus):
     fixed = [each.text for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
     assert fixed == [
         "min voltage limit 140 → 95",
-        "rebooted because it had a hardware error: input voltage outside its limits",
+        "rebooted (hardware error: input voltage outside its limits)",
     ]
     assert [each.status for each in told(bus)] == ["pass"]
 
@@ -232,10 +232,7 @@ def test_an_error_that_a_reboot_does_not_clear_is_reported(bus):
     bus.fault("undervoltage=1")
     until(lambda: held(bus, reg.HARDWARE_ERROR_STATUS) == 1)
     (left,) = [each for each in provision(backend_settings(bus.port)) if each.subject == LEFT]
-    assert (
-        left.text
-        == "it still reports a hardware error after a reboot: input voltage outside its limits"
-    )
+    assert left.text == "hardware error: input voltage outside its limits, even after a reboot"
     assert left.fix == "remove the cause, and run the command again"
 
 

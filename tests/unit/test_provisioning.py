@@ -1,6 +1,7 @@
 """Test the search, identification and configuration of servos on an emulated line."""
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,7 +13,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.port import UNPACED_TIMEOUT, PortLost
-from softfinger.daemon.servos.protocol import ServoLine
+from softfinger.daemon.servos.protocol import PacketHandler, ServoLine
 from softfinger.daemon.servos.provisioning import (
     Found,
     FoundServo,
@@ -212,7 +213,7 @@ def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
 @pytest.mark.parametrize(
     ("fault", "register", "value", "done"),
     [
-        ("overload", None, 0, f"{RIGHT}: rebooted because it had a hardware error: overload"),
+        ("overload", None, 0, f"{RIGHT}: rebooted (hardware error: overload)"),
         (
             "",
             reg.TORQUE_ENABLE,
@@ -221,6 +222,7 @@ def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):
         ),
         ("", reg.DRIVE_MODE, 0b1100, f"{LEFT}: drive mode 12 → 4"),
         ("", reg.STATUS_RETURN_LEVEL, 0, f"{LEFT}: status return level 0 → 2"),
+        ("", reg.GOAL_PWM, 500, f"{LEFT}: goal PWM 500 → 885"),
     ],
 )
 def test_configured_registers(wired, fault, register, value, done):
@@ -229,10 +231,29 @@ def test_configured_registers(wired, fault, register, value, done):
         bus.bus.fault(fault, 2, 0.0)
     if register is not None:
         bus.servos[0].table.set(register, value)
+    bus.servos[0].table.set(reg.BUS_WATCHDOG, 255)  # The watchdog has stopped the servo.
     assert bus.provision() == ([done], [])
     assert bus.servos[1].table.get(reg.HARDWARE_ERROR_STATUS) == 0
     assert not bus.servos[0].torque_on
     assert bus.servos[0].table.get(reg.STATUS_RETURN_LEVEL) == 2
+
+
+def test_a_register_that_only_the_settings_can_correct_is_not_reported_as_fixed(wired):
+    """With the zero position near 0, the joint range includes negative positions."""
+    done, problems = wired().provision(mode="position", zero=(50, 2048))
+    assert done == named(LEFT, "operating mode 5 → 3") + named(RIGHT, "operating mode 5 → 3")
+    assert len(problems) == 1
+    assert problems[0].startswith(f"{LEFT}: min position limit is 0, the joint requires -276")
+
+
+def test_a_reboot_without_effect_is_not_reported_as_a_correction(wired, monkeypatch):
+    bus = wired()
+    bus.bus.plant.q[0] = 4.0 * math.pi
+    monkeypatch.setattr(PacketHandler, "reboot", lambda *_: None)
+    done, (problem,) = bus.provision()
+    assert done == []
+    assert "position wrong by at least one turn" in problem
+    assert "even after a reboot" in problem
 
 
 def test_failed_and_successful_configurations_are_both_reported(wired):
