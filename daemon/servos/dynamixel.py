@@ -250,9 +250,11 @@ class DynamixelServos:
             reading.current[f] = scale.amperes(current)
             if group.errors[joint.id] & 0x80:
                 alert |= 1 << f
+        if alert != reading.alert:
+            reading.hardware[:] = 0, 0
         if alert:
             self._alerts += 1
-            if alert != reading.alert:
+            if not any(reading.hardware):
                 self._ask_errors(reading)
         reading.alert = alert
         return group

@@ -96,7 +96,6 @@ class SimulatedServos:
         if reading.t - self._health_read >= _HEALTH_INTERVAL:
             self._read_health(reading)
         reading.seq += 1
-        reading.lost = reading.frozen = 0
         reading.valid = True
 
     def _read_health(self, reading: Reading) -> None:
@@ -115,7 +114,10 @@ class SimulatedServos:
             self._pressed[joint] = self._pressed[joint] + passed if pressed else 0.0
             hot = heat.sensed > self._model.temperature_limit
             over = self._pressed[joint] > _OVERLOAD_TIME
-            errors = self._errors[joint] = hot << reg.OVERHEATING | over << reg.OVERLOAD
+            errors = hot << reg.OVERHEATING | over << reg.OVERLOAD
+            # A servo keeps an error until a reboot; a simulated servo, until torque is off.
+            errors |= self._errors[joint] if self._torque else 0
+            self._errors[joint] = errors
             reading.hardware[joint] = errors
             reading.alert |= bool(errors) << joint
         if reading.alert and self._torque:

@@ -6,6 +6,7 @@ import time
 from collections import deque
 
 import pytest
+from dynamixel_sdk.robotis_def import COMM_RX_TIMEOUT
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import ServoError
@@ -225,6 +226,25 @@ def test_a_late_reply_is_not_used_for_a_later_request(running, firmware, latenes
     assert backend.counters()["late"] >= 30 - lateness
     bus.call(lambda: setattr(bus.bus, "exchange", reply_to_all))
     until(read_at_another_place)
+
+
+def test_the_hardware_error_belongs_to_the_present_alert(bus, connect):
+    backend, reading = connect(bus), Reading()
+    bus.fault("overload=1")
+    backend.read(reading)
+    assert reading.hardware == [1 << reg.OVERLOAD, 0]
+    bus.fault("reboot=1")
+    until(lambda: (backend.read(reading), reading.valid and not reading.alert)[1])
+    assert reading.hardware == [0, 0]
+    # The reply that explains the next alert is lost, so the daemon asks again.
+    bus.fault("overheat=1")
+    errors = backend._reads.errors
+    errors.exchange, exchange = lambda: COMM_RX_TIMEOUT, errors.exchange
+    until(lambda: (backend.read(reading), reading.alert)[1])
+    assert (reading.alert, reading.hardware) == (1, [0, 0])
+    errors.exchange = exchange
+    backend.read(reading)
+    assert reading.hardware == [1 << reg.OVERHEATING, 0]
 
 
 def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):

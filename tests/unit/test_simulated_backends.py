@@ -53,6 +53,17 @@ class Bench:
 # Servos.
 
 
+def test_a_hardware_error_persists_until_torque_is_off():
+    bench = Bench(servos={"current_limit": (0.3, 0.3)})
+    bench.grasp(current=0.3, seconds=4.0)  # After the overload, the motors draw no current.
+    assert bench.reading.alert == 0b11
+    assert np.abs(bench.hand.current).max() < 1e-6
+    assert bench.servos.torque_off(bench.reading)
+    bench.clock.sleep_until(bench.clock.now() + 0.5)
+    bench.servos.read(bench.reading)
+    assert bench.reading.alert == 0
+
+
 def test_goals_are_whole_counts():
     bench = Bench()
     bench.servos.connect()
