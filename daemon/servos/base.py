@@ -84,7 +84,7 @@ class Servos(Protocol):
         """Send each joint's goal angle and current limit."""
 
     def counters(self) -> dict[str, int]:
-        """Return the number of failed exchanges since `connect` by type, such as ``timeouts``."""
+        """Return the number of failed exchanges since the start, by type such as ``timeouts``."""
 
     def close(self) -> None:
         """Try to switch torque off and close the port. Never raises."""

@@ -57,7 +57,8 @@ _CHECK_FRACTION = 0.05  # maximum fraction of the line capacity used by checks
 _RECENT_TIME = 0.035  # maximum age of a recent goal [s]
 _FROZEN_TIME = 0.1  # maximum time for which a servo's 1 ms clock may stop [s]
 _VARIED_READ_COUNT = 32  # number of requests with varying span lengths after a missing reply
-_CHECK_TIMEOUT = 0.2  # reply timeout during the checks [s]; `clear` blocks the loop for this time
+# Reply timeout during the checks [s]. A missing servo blocks the loop for four timeouts.
+_CHECK_TIMEOUT = 0.2
 # Reply timeout for an emulated hand [s]. The hand's clock pauses while the machine is late.
 _BUSY_TIME = 0.04
 _CLOSING_TRY_COUNT = 10  # number of torque-off attempts before the port is closed
@@ -349,7 +350,7 @@ class DynamixelServos:
     # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Return the number of failed exchanges since `connect`, by type."""
+        """Return the number of failed exchanges since the start, by type."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,

@@ -43,6 +43,7 @@ class LineFaults:
 
 
 LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
+_DELAY_MAX = 1.0  # s
 _SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
 SERVO_FAULTS = ("silent", "answer", "reboot", *_SERVO_FAILURES, "recover")
 BOARD_FAULTS = {  # default probability of each fault
@@ -167,6 +168,8 @@ class _Form(NamedTuple):
         """Return the minimum and maximum allowed values."""
         if kind in MEASUREMENT_FAULTS:
             return MEASUREMENT_FAULTS[kind][1:]
+        if kind == "delay":
+            return 0.0, _DELAY_MAX
         return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
 
 
@@ -176,7 +179,8 @@ _ID = "=ID"
 _FORMS = (
     _Form(SERVO_FAULTS, _ID, (SERVOS,)),
     _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True),
-    _Form(LINE_FAULTS, "=PROBABILITY", (SERVOS,)),
+    _Form([kind for kind in LINE_FAULTS if kind != "delay"], "=PROBABILITY", (SERVOS,)),
+    _Form(("delay",), "=SECONDS", (SERVOS,)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
     # `push` is a force along the faces, away from the palm [N]. `twist` is a torque [N·m].
     _Form(("push", "twist"), "=NUMBER", (OBJECT,)),
@@ -250,7 +254,8 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
         value = BOARD_FAULTS.get(kind, 1.0)
     low, high = form.bounds(kind)
     if not low <= value <= high:
-        raise refused(f"expected a {form.value.strip('[=]').lower()} of {low:g} to {high:g}")
+        unit = form.value.strip("[=]").lower()
+        raise refused(f"found {value:g}, expected {low:g} to {high:g} ({unit})")
     return [
         FaultEvent(after, part, kind, value, until - after)
         for part in ((side,) if side else form.parts)

@@ -8,7 +8,7 @@ import select
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Self
@@ -212,7 +212,8 @@ class EmulatedBus:
         while self._running:
             wait = min(max(0.0, self._terminal.next_event() - self.now()), _LOOK)
             ports = [self._terminal] if self._terminal.plugged else []
-            select.select(ports, [], [], wait)
+            with suppress(OSError, ValueError):  # Another thread may have unplugged the port.
+                select.select(ports, [], [], wait)
             with self._between_packets:
                 self._terminal.service(self.now())
 

@@ -148,7 +148,8 @@ def test_links_that_were_redirected_are_not_removed(tmp_path):
     [
         (["--fault", "melted"], 1, "wrong-size"),
         (["--fault", "silent=9"], 1, "no servo has this ID"),
-        (["--fault", "lose=2"], 1, "expected a probability of 0 to 1"),
+        (["--fault", "lose=2"], 1, "found 2, expected 0 to 1 (probability)"),
+        (["--fault", "delay=2"], 1, "found 2, expected 0 to 1 (seconds)"),
         (["--model", "AX-12"], 2, "XM430-W350"),
         (["--baud", "1234"], 1, "baud"),
         (["--ids", "1"], 2, "expected two IDs between 0 and 252"),

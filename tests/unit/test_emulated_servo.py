@@ -106,6 +106,13 @@ def test_a_shadow_id_is_executed_without_a_reply() -> None:
     assert [servo.table.get(reg.LED) for servo in c.bus.servos] == [1, 1]
 
 
+def test_the_factory_shadow_id_is_not_an_id() -> None:
+    c = BusClient()
+    item = struct.pack("<HH", reg.LED, 1) + bytes((255, 1))
+    assert c.send(framing.BROADCAST, framing.SYNC_WRITE, item) == b""
+    assert not any(servo.table.get(reg.LED) for servo in c.bus.servos)
+
+
 def test_torque_on_at_power_up_if_configured() -> None:
     c = BusClient()
     assert c.write(reg.STARTUP_CONFIGURATION, 1, 1) == 0
@@ -164,6 +171,7 @@ def test_the_velocity_limit_applies_to_profile_and_velocity_mode() -> None:
     limited = travelled((reg.VELOCITY_LIMIT, 20, 4), profile)
     # The joint lags behind the profile, so the distance is shorter than at 20 · 0.229 rpm.
     assert limited < 20 * 0.229 / 60.0 * 4096 * 0.1 < travelled(profile)
+    assert travelled((reg.VELOCITY_LIMIT, 0, 4), profile) <= 1
     c = BusClient()
     for address, value, size in (
         (reg.OPERATING_MODE, reg.VELOCITY_MODE, 1),

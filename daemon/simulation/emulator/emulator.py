@@ -311,7 +311,10 @@ class Emulator:
             return self.press(text.partition("press")[2])
         try:
             faults = [word for word in words if word not in _REQUESTS]
-            fresh = parse_faults(faults, self._ids)
+            # A client may have changed the IDs.
+            bus = self._servos and self._servos.bus
+            ids = self._ids if bus is None else tuple(servo.id for servo in bus.servos)
+            fresh = parse_faults(faults, ids)
         except FaultError as error:
             return f"error: {error}"
         now = self.clock.now()

@@ -12,6 +12,7 @@ from softfinger.daemon.servos.control_table import crc16
 
 HEADER: Final = b"\xff\xff\xfd"
 BROADCAST: Final = 0xFE
+ID_MAX: Final = 252
 
 PING: Final = 0x01
 READ: Final = 0x02

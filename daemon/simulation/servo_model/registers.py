@@ -67,7 +67,7 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
         _read_only(reg.MODEL_NUMBER, 2, model.number),
         _read_only(reg.MODEL_INFORMATION, 4),
         _read_only(reg.FIRMWARE_VERSION, 1, firmware),
-        _setting(reg.ID, 1, 1, 0, 252),
+        _setting(reg.ID, 1, 1, 0, framing.ID_MAX),
         _setting(reg.BAUD_RATE, 1, 1, 0, model.highest_baud),
         _setting(reg.RETURN_DELAY_TIME, 1, 250, 0, 254),
         _setting(reg.DRIVE_MODE, 1, 0, 0, model.drive_mode_max),

@@ -2,8 +2,9 @@
 
 The model covers torque, operating modes, limits, profiles, the bus watchdog, hardware errors,
 shutdown and reboot. :mod:`simulation.servo_model.servo_bus` handles the packets. PWM mode, which no
-known client uses, is rejected as out of range. The emulator ignores the integral gain. The emulator
-also ignores the option to restore RAM from a backup at startup.
+known client uses, is rejected as out of range. The emulator ignores the integral gain, the option
+to restore RAM from a backup at startup, and the drive mode bit that switches torque on when a goal
+is written.
 
 The manuals do not specify how a servo handles partly invalid writes and torque-on requests after a
 shutdown. In this emulation, a write that violates any rule leaves all registers unchanged. After a
@@ -95,11 +96,12 @@ class EmulatedServo:
 
     @property
     def shadow(self) -> int:
-        """Secondary ID; the servo executes instructions to this ID without replying.
+        """Secondary ID, or −1; the servo executes instructions to this ID without replying.
 
-        The values 253 to 255 disable the secondary ID.
+        The register values 253 to 255 disable the secondary ID.
         """
-        return self._memory[reg.SHADOW_ID]
+        value = self._memory[reg.SHADOW_ID]
+        return value if value <= framing.ID_MAX else -1
 
     @property
     def old_protocol(self) -> bool:
@@ -251,7 +253,6 @@ class EmulatedServo:
         keep = {0xFF: (), 1: (reg.ID,), 2: (reg.ID, reg.BAUD_RATE)}.get(option[0])
         if keep is None:
             return framing.DATA_RANGE
-        self.table.set(reg.TORQUE_ENABLE, 0)
         self.table.reset(keep)
         self.reboot(t)
         return framing.OK

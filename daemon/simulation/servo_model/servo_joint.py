@@ -122,8 +122,10 @@ class ServoJoint:
             profile.hold(target)  # A profile velocity of 0 disables the profile.
         elif memory[reg.DRIVE_MODE] & 4:
             profile.aim_in(target, speed / 1000.0, acceleration / 1000.0)
+        elif not (limit := table.get(reg.VELOCITY_LIMIT)):
+            self.hold()
         else:
-            speed = min(speed, table.get(reg.VELOCITY_LIMIT))
+            speed = min(speed, limit)
             profile.aim(target, speed * _PER_VELOCITY, acceleration * _PER_ACCELERATION)
 
     def moves_by_itself(self) -> bool:
