@@ -132,6 +132,12 @@ class Torque:
                 check_angle(joint.name, joint.scale, positions[i], self._hand, joint.finger)
                 for i, joint in self._joints.items()
             ]
+            if self._mode == reg.POSITION_MODE:  # The servo refuses goals outside its limits.
+                for i, joint in self._joints.items():
+                    low, high = joint.ends
+                    if not low <= positions[i] <= high:
+                        found = f"the position is {positions[i]} counts, expected {low} to {high}"
+                        strayed.append(Finding("FAIL", joint.name, found, "turn the joint by hand"))
             if any(strayed):
                 raise ServoError("\n".join(str(each) for each in strayed if each))
             if self._mode == reg.CURRENT_MODE:

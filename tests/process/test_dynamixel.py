@@ -228,6 +228,15 @@ def test_a_late_reply_is_not_used_for_a_later_request(running, firmware, latenes
     until(read_at_another_place)
 
 
+def test_a_joint_outside_its_servo_limits_is_named_in_position_mode(running, connect):
+    bus = running(servos={"mode": "position"})
+    bus.call(lambda: bus.servo(0).table.set(reg.MAX_POSITION_LIMIT, 2700))
+    bus.call(lambda: bus.bus.plant.q.__setitem__(0, 702 * RADIAN))
+    backend = connect(bus, mode="position")
+    with pytest.raises(ServoError, match="the position is 2750 counts, expected 0 to 2700"):
+        backend.torque_on()
+
+
 def test_the_hardware_error_belongs_to_the_present_alert(bus, connect):
     backend, reading = connect(bus), Reading()
     bus.fault("overload=1")
