@@ -3,8 +3,9 @@
 The simulated hand and the daemon have separate settings. In each of the *rows*, one parameter
 differs from its setting by an amount that is typical of a healthy hand. In the *ensemble*, all
 parameters are drawn at random. If MuJoCo is installed, the first hands of the ensemble also grip an
-object in MuJoCo, without the stiction and relaxation that this plant does not simulate. Grips run
-in virtual time, so the results do not depend on the machine.
+object in MuJoCo, without the stiction and relaxation that this plant does not simulate. In the
+*sensor grips*, only the object's mass and the torque constant differ from the settings, and the
+object is rotated. Grips run in virtual time, so the results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -12,17 +13,19 @@ from __future__ import annotations
 import math
 import random
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from typing import Any
+
+import numpy as np
 
 from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.faults import EIGHT_BITS
 from softfinger.tools.benchmarks.measuring import Report
-from softfinger.tools.benchmarks.rigs import Sections, merged
+from softfinger.tools.benchmarks.rigs import SENSORS, Sections, merged
 from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch, diagnoses
 
 _TRIAL_COUNT, _HAND_COUNT, _MUJOCO_COUNT = 20, 400, 100
@@ -96,11 +99,16 @@ ROWS = (
     ),
 )
 
+_IDEAL = "ideal"  # sensor that adds only noise
+_SENSOR_COUNT = 24  # number of grips with each sensor
+_TURN = math.radians(8.0)
+_SIGMA = 1.96  # half width of a 95 % interval, in standard deviations
 _ENSEMBLE, _MUJOCO = "hand ", "mujoco "
 NAMES = (
     *(case.name for case in ROWS),
     *(f"{_ENSEMBLE}{seed}" for seed in range(1, _HAND_COUNT + 1)),
     *(f"{_MUJOCO}{seed}" for seed in range(1, _MUJOCO_COUNT + 1) if find_spec("mujoco")),
+    *(f"{sensor} {k}" for sensor in (_IDEAL, *SENSORS) for k in range(1, _SENSOR_COUNT + 1)),
 )
 
 
@@ -182,11 +190,26 @@ def drawn_in_mujoco(seed: int) -> HandCase:
     return replace(case, name=f"{_MUJOCO}{seed}", hand=hand, daemon=daemon, torque=1.0)
 
 
+def sensor_grips(sensor: str) -> Iterator[HandCase]:
+    """Yield grips of 4, 8 and 12 N with a sensor; the object is rotated by ±8°."""
+    for k in range(1, _SENSOR_COUNT + 1):
+        name = f"{sensor} {k}"
+        chance = random.Random(name)
+        mass = 0.1 * 2.0 ** chance.uniform(-1.0, 1.0)
+        force = (4.0, 8.0, 12.0)[k % 3]
+        torque = chance.uniform(0.9, 1.1)
+        hand, turn = _hand(seed=k, object_mass=mass), math.copysign(_TURN, k % 2 - 0.5)
+        yield HandCase(name, force, hand, SENSORS.get(sensor, {}), torque, turn=turn)
+
+
 @dataclass
 class Outcome:
     """Outcome of a grip. Forces are relative to the requested force, and times are in s."""
 
     held: bool = False  # True if the mode `holding` was reached
+    estimate_error: float = math.nan  # (estimated − true force)/true force, mean of the tips
+    inside_count: int = 0  # number of tips whose true force is inside the published 95 % interval
+    angle_error: float = math.nan  # true − commanded object angle [rad]
     settled: float = math.nan  # mean final force of the two tips, or NaN if the object was released
     peak: float = 0.0  # maximum force of either tip before the load is applied
     above: float = 0.0  # longest time above `_EXCESS_RATIO` before the load [s]
@@ -229,6 +252,12 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
             loop.advance(2.0)
         gripped = state.mode in GRIPPING_MODES
         found.settled = watch.settled() if gripped else math.nan
+        if gripped:
+            force, std = np.array([[each.force, each.force_std] for each in state.contacts]).T
+            off = force - hand.plant.force
+            found.estimate_error = float((off / hand.plant.force).mean())
+            found.inside_count = int(np.count_nonzero(np.abs(off) < _SIGMA * std))
+            found.angle_error = float(hand.plant.object_pose[2]) - case.turn
         found.peak, found.above = watch.peak, watch.above
         found.first_off = watch.first_off(_ERROR_MAX)
         if case.load and gripped and hand.between():
@@ -266,9 +295,13 @@ def measure(
         for draw, count in ((drawn, _HAND_COUNT), (drawn_in_mujoco, _MUJOCO_COUNT))
         if draw is drawn or find_spec("mujoco")
     ]
+    sensors = {
+        sensor: [case for case in sensor_grips(sensor) if only in case.name and not brief]
+        for sensor in (_IDEAL, *SENSORS)
+    }
     seeds = range(1, trials + 1)
     jobs = [(case, seed) for case in rows for seed in seeds]
-    jobs += [(hand, 1) for hands in ensembles for hand in hands]
+    jobs += [(hand, 1) for hands in (*ensembles, *sensors.values()) for hand in hands]
     outcomes = (Outcome(**each) for each in sweep(_outcome, jobs))
     reports = []
     if rows:
@@ -280,7 +313,25 @@ def measure(
     for title, hands in zip(("random hands", "random hands in MuJoCo"), ensembles, strict=False):
         if hands:
             reports.append(_ensemble(title, hands, [next(outcomes) for _ in hands]))
+    grips = {name: [next(outcomes) for _ in cases] for name, cases in sensors.items() if cases}
+    if grips:
+        reports.append(Report("grips", [_sensor_row(*each) for each in grips.items()]))
     return reports
+
+
+def _sensor_row(sensor: str, found: list[Outcome]) -> dict[str, Any]:
+    def rms(errors: Iterable[float]) -> float:
+        return float(np.sqrt(np.mean(np.square(list(errors)))))
+
+    return {
+        "name": sensor,
+        "held": sum(each.held for each in found),
+        "of": len(found),
+        "true − commanded force, rms %": 100.0 * rms(each.settled - 1.0 for each in found),
+        "estimated − true, rms %": 100.0 * rms(each.estimate_error for each in found),
+        "inside the 95 % interval": sum(each.inside_count for each in found),
+        "angle, rms °": math.degrees(rms(each.angle_error for each in found)),
+    }
 
 
 def _row(case: HandCase, found: list[Outcome]) -> dict[str, Any]:
@@ -320,6 +371,12 @@ def _ensemble(title: str, hands: list[HandCase], found: list[Outcome]) -> Report
         ),
         share("objects lost", "≤ 1 %", sum(e.lost for e in loaded), max(len(loaded), 1)),
         share("healthy measurement channel reported", "≤ 2 %", sum(bool(e.accused) for e in found)),
+        share(
+            "true tip force inside the 95 % interval",
+            "90–98 %",
+            sum(each.inside_count for each in found),
+            max(2 * sum(not math.isnan(each.settled) for each in found), 1),
+        ),
         share("never held", "", sum(not each.held for each in found)),
         share("released", "", sum(math.isnan(each.settled) for each in found)),
         share("force increased without a load", "", sum(each.raised for each in found)),
