@@ -88,7 +88,7 @@ class HeatWatch:
         dt = reading.t - self._t
         self._t = reading.t
         self.due = False
-        if not dt > 0.0:
+        if not 0.0 < dt < math.inf:  # The first reading may have failed, so its time is −∞.
             return
         for i in self._fingers:
             self._heat[i] += reading.current[i] * reading.current[i] * dt

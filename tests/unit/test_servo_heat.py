@@ -1,5 +1,6 @@
 """Test the prediction of servo temperatures with unknown constants, and the daemon's reactions."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,16 @@ def test_the_winding_error_matches_its_standard_deviation():
             ratios.append((told.winding - bench.plant.winding) / told.winding_std)
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.5
     assert np.abs(ratios).max() < 3.0
+
+
+def test_a_failed_first_reading_does_not_change_the_prediction():
+    plain, late = Bench(0), Bench(0)
+    late.state.reading.t = -math.inf
+    late._watch.update()
+    for _ in range(20):
+        told = plain.step(2.0)
+        assert late.step(2.0) == told
+    assert told < TIME_MAX
 
 
 def test_half_of_the_lasting_current_causes_no_warning():
