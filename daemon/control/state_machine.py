@@ -273,9 +273,8 @@ class Control:
             self.grip.retarget(force)
             self._change(state)
         elif isinstance(state, Approaching):
-            self._enter(
-                Approaching(GraspCommand(force, is_streamed, state.command.angle), state.touching)
-            )
+            # Keep the timers, because a client may stream setpoints.
+            state.command.force, state.command.is_streamed = force, is_streamed
         else:
             self.fingers.hold_here()
             self._enter(Approaching(GraspCommand(force, is_streamed)))

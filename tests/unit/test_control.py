@@ -336,6 +336,28 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
         assert hand.plant.force.mean() > 15.0, "the grip must still react to a sudden load"
 
 
+@pytest.mark.parametrize(
+    ("scene", "q_max", "mode"),
+    [
+        ({}, 1.0, "releasing"),
+        ({"fingers": ("left",)}, 0.3, "armed"),
+    ],
+    ids=["the tips meet", "the joint limit is reached"],
+)
+def test_a_stream_of_setpoints_without_an_object_ends_like_a_grasp(scene, q_max, mode):
+    sections = {"scene": scene, "hand": {"q_max": (q_max, q_max)}}
+    with watched(sections | {"simulation": {"object_shape": "none"}}) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        for k in range(400):
+            hand.command("hold", force=8.0 + 0.01 * (k % 2))
+            hand.run(0.02)
+            if hand.mode != "grasping":
+                break
+        assert hand.mode == mode
+        assert [kind for level, kind, _ in hand.events if level != "info"] == ["grasp"]
+
+
 def test_force_and_angle_setpoints_may_be_sent_separately_and_are_bounded():
     with watched({}) as hand:
         grasped(hand, 8.0)
