@@ -399,6 +399,7 @@ class Control:
         elif state.arrived_for > _STUCK_TIME:
             text = f"{state.mode.value}: stopped {math.degrees(off):.1f}° before the goal"
             self._warn("short", text)
+            self.fingers.hold_here()
             self._enter_armed()
 
     def _approach(self, state: Approaching, dt: float) -> None:

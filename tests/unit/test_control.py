@@ -180,6 +180,22 @@ def test_targets_streamed_right_after_arming_move_the_hand_smoothly():
         assert np.ptp(way, axis=0).min() > 0.02, "a stream of targets must still move the joints"
 
 
+def test_joints_that_stop_before_their_goal_do_not_keep_pressing():
+    with watched({}) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        hand.run(0.2)
+        hand.command("move", left=0.3, right=0.3)  # The object stops both fingers.
+        hand.run(1.0)
+        pressed = hand.plant.force.mean()
+        while hand.mode == "moving":
+            hand.run(0.01)
+        hand.run(1.0)
+        assert hand.mode == "armed"
+        assert [kind for level, kind, _ in hand.events if level != "info"] == ["short"]
+        assert hand.plant.force.mean() < 0.7 * pressed
+
+
 def test_compliance_lets_the_object_yield_within_bounds():
     yielded = []
     for compliance in (0.02, 0.5):
