@@ -15,6 +15,8 @@ from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import State
 
+CLIENT = "task"  # client name in the commands of a task
+
 Step = tuple[dict[str, Any], Mode, float]  # command, final mode and subsequent pause [s]
 
 _STEP_TIMEOUT = 10.0  # s
@@ -47,7 +49,7 @@ class Task:
         return None if settings.task.name == "none" else Task(settings)
 
     def next(self, state: State, dt: float) -> dict[str, Any] | None:
-        """Return the command that is due on this tick, or None.
+        """Return the command that is due on this tick, with the client name CLIENT, or None.
 
         Raises
         ------
@@ -67,7 +69,7 @@ class Task:
             return None
         request, self._end_mode, self._pause = next(self._steps)
         self._remaining, self._waited = self._pause, 0.0
-        return request
+        return request | {"client": CLIENT}
 
     def restart(self, state: State, reason: str) -> str:
         """Schedule a pause and a restart of the script; return the event text."""

@@ -304,7 +304,7 @@ class Loop:
                 self._safety.limited["commands.pace"] = self._server.link.refused
             return self._requests.carry_out(request)
         try:
-            reply = self._requests.carry_out(request, age)
+            reply = self._requests.carry_out(request, age, by_task)
         except Refused as refusal:
             self._publish_command(request, str(refusal))
             raise
@@ -334,6 +334,7 @@ class Loop:
                 self.emit("warning", "task", task.restart(self.state, str(reason)))
             else:
                 self._end_task(str(reason))
+                self._requests.end_grip(self._settings.commands.on_silence)
 
     def _end_task(self, reason: str) -> None:
         self._task = None

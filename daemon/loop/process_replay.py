@@ -9,10 +9,11 @@ tick.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from softfinger.daemon.clock import VirtualClock
+from softfinger.daemon.control.task import CLIENT
 from softfinger.daemon.errors import Refused, ServoError
 from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.perception.finger_model import FingerModel
@@ -20,7 +21,6 @@ from softfinger.daemon.perception.perception import Perception
 from softfinger.daemon.profile.settings import Settings, TaskSettings
 from softfinger.daemon.tactile.replay import GivenFrames
 from softfinger.daemon.types import FINGERS, Frame, Goal, Reading, State
-from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.loop_link import Link
 
 
@@ -147,9 +147,9 @@ class _Commands:
         self.waiting: Sequence[dict[str, Any]] = ()
         self.link = Link()
 
-    def serve(self, handler: Handler) -> None:
+    def serve(self, handler: Callable[..., Any]) -> None:
         for request in self.waiting:
             try:
-                handler(request, 0.0)
+                handler(request, 0.0, request.get("client") == CLIENT)
             except Refused:
                 pass  # After a refusal, the replayed states differ from the recording.

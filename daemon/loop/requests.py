@@ -98,7 +98,8 @@ class Lease:
     The lease expires after a period without commands from the client.
 
     All unnamed clients share one lease. Commands that can only make the hand safer require no
-    lease.
+    lease. Commands of a task require no lease and end any lease, so every client can take over from
+    a task.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -125,11 +126,11 @@ class Lease:
         self._until = -math.inf
         return self._owner or "the client in control"
 
-    def renew(self, command: Command, now: float) -> None:
-        """Grant or extend the client's lease after a command has been executed."""
+    def renew(self, command: Command, now: float, by_task: bool = False) -> None:
+        """Grant, extend or end the lease after a command has been executed."""
         if command.name not in NO_LEASE_COMMANDS:
             self._owner = command.client
-            self._until = now + self.seconds
+            self._until = -math.inf if by_task else now + self.seconds
 
 
 class Requests:
@@ -178,13 +179,16 @@ class Requests:
         self._lease = Lease(settings.commands.lease)
         self._envelope = Envelope(settings)
 
-    def carry_out(self, request: dict[str, Any], age: float = 0.0) -> dict[str, Any]:
+    def carry_out(
+        self, request: dict[str, Any], age: float = 0.0, by_task: bool = False
+    ) -> dict[str, Any]:
         """Execute a request on the current tick and return the reply.
 
         Parameters
         ----------
         request : command with its parameters
         age : time since the request arrived [s]
+        by_task : True if the request comes from a task
 
         Raises
         ------
@@ -199,14 +203,15 @@ class Requests:
         command = name, numbers, _ = parse(request, control.mode)
         grasps = name == "grasp" or (name == "hold" and control.mode not in GRIPPING_MODES)
         self._check_age(name, age)
-        self._lease.check(command, state.t)
+        if not by_task:
+            self._lease.check(command, state.t)
         if name == "clear":
             self._reconnect()
         if name in ("clear", "arm"):
             self._reopen(name)
         self._check(name, numbers, grasps)
         angle = self._handlers[name](**numbers)
-        self._lease.renew(command, state.t)
+        self._lease.renew(command, state.t, by_task)
         reply: dict[str, Any] = {"mode": control.mode.value}
         if angle is not None:
             reply["angle"] = angle

@@ -380,7 +380,7 @@ class CommandSettings(Section):
         2.0, "s", "Time for which a client keeps control of the hand after its last command."
     )
     on_silence: Literal["hold", "release", "stop"] = setting(
-        "hold", "", "Action when the lease of the client in control expires."
+        "hold", "", "Action when the lease of the client in control expires, or when a task fails."
     )
     max_bytes: int = setting(4096, "bytes", "Maximum size of a command.", ge=64, le=65_536)
     per_second: float = setting(

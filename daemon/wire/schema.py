@@ -545,7 +545,9 @@ class AnsweredCommand(_Announcement):
     tick: int = _command("", "seq of the tick that replied to the command")
     command: str = _command("", "name of the command", lambda m: str(m.request.get("command", "")))
     client: str = _command(
-        "", "name of the client, or empty", lambda m: str(m.request.get("client", ""))
+        "",
+        "name of the client, `task` for a task, or empty",
+        lambda m: str(m.request.get("client", "")),
     )
     request: str = _command(
         "", "complete request as JSON", lambda m: json.dumps(m.request, default=str)

@@ -102,6 +102,18 @@ def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
         recompute(write_recording(tmp_path / "other.mcap", taken), other)
 
 
+def test_a_task_that_a_client_ends_recomputes_bitwise(tmp_path):
+    """The live hand ignores silence during a task, but not after a client has taken over."""
+    due = {1000: {"command": "grasp", "force": 5.0}}
+    used = ("stream.state_rate=500", "commands.lease=0.2", "commands.on_silence=release")
+    path = tmp_path / "task.mcap"
+    assert record_hand(path, due, 2.5, (*used, "task.name=demo")) == []
+    sent = list(Recording(path).messages())
+    modes = [message["mode"] for topic, message in sent if topic == schema.STATE]
+    assert [modes[k] for k in (998, 1098, 1110)] == ["holding", "holding", "releasing"]
+    assert recompute(Recording(path)).differences == {}
+
+
 def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_path, inline):
     path = tmp_path / "run.mcap"
     words = ("--duration", "3", "--set", "task.name=demo", "--record", str(path))

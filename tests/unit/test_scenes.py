@@ -80,6 +80,29 @@ def test_the_demo_of_a_real_hand_ends_with_the_first_fault(make):
     assert daemon.loop.state.fault == "made up"
 
 
+@pytest.mark.parametrize(("action", "mode"), [("hold", "holding"), ("release", "releasing")])
+def test_a_real_hand_whose_task_fails_follows_its_settings(make, action, mode):
+    daemon = make(commands={"on_silence": action}, task={"name": "demo"})
+    daemon.loop._task.restarts = False
+    events = holding_demo(daemon)
+    daemon.loop._task._end_mode = "moving"  # The hand never enters this mode.
+    while not events:
+        daemon.loop.advance(0.1)
+    assert events[0] == ("warning", "task", "task ended: still holding after 10 s")
+    assert daemon.loop.state.mode == mode
+
+
+def test_named_clients_take_over_from_a_demo_that_any_client_started(make):
+    loop = (daemon := make(task={"name": "demo"})).loop
+    for client in ("page", "other"):
+        advance_to(daemon, "holding", 5.0)
+        assert loop.command({"command": "release", "client": client})["mode"] == "releasing"
+        assert f"release: {client} holds the lease" in refusal(daemon, "release")
+        loop.command({"command": "stop"})
+        loop.advance(2.1)
+        loop.command({"command": "demo", "client": "page"})
+
+
 SCENES: dict[str, dict[str, Any]] = {
     "two fingers": {},
     "one finger": {"scene": {"fingers": ("left",)}},
