@@ -39,7 +39,7 @@ _STANDSTILL_SPEED = 0.05  # speed below which a joint counts as stationary [rad/
 # Smallest relative increase in commanded force that is checked. The tips must measure at least this
 # fraction of the increase.
 _FORCE_RISE_MIN = 0.2
-_RESPONSE_TIME = 0.3  # time within which the measured force must respond to an increase [s]
+_RESPONSE_TIME = 0.3  # minimum time for the measured force to respond to an increase [s]
 _STEP_TOLERANCE = 0.02  # tolerance added to the largest step possible at maximum velocity [rad]
 _DRIFT_MAX = 0.1  # allowed difference between the angle and the integrated velocity [rad]
 _DRIFT_TIME = 0.1  # time window of the drift check [s]; the window allows for velocity lag
@@ -129,6 +129,11 @@ class View:
         self._target = math.nan  # commanded grip force on the previous tick [N]
         self.rise_t = math.inf  # time of a commanded force increase that is not yet measured [s]
         self.rise_felt = 0.0  # measured force at `rise_t` [N]
+        # Time within which the measured force must respond to an increase [s]. It is at least the
+        # time in which the setpoint reaches its target (see `control.setpoint.Setpoint`).
+        control = settings.control
+        ramp_time = control.force_time + 1.5 * control.smooth_time
+        self.response_time = max(_RESPONSE_TIME, ramp_time)
         model = by_name(servos.model)
         self.voltage = (
             self.limits.voltage_min or model.voltage_min * VOLTAGE_UNIT,
@@ -687,10 +692,11 @@ for _finger, _side in enumerate(FINGERS):
     _add_consistency_checks(_finger, _side)
 
 
-@Limit("consistency.force", "measured force that has not followed the commanded force for 0.3 s",
-    "fault", (), "sensors", in_turn=True)  # fmt: skip
+@Limit("consistency.force", "measured force that has not followed the commanded force for 0.3 s, "
+    "or for the duration of the force ramp if the ramp takes longer", "fault",
+    ("control.force_time", "control.smooth_time"), "sensors", in_turn=True)  # fmt: skip
 def _force_response(view: View, state: State, _: float) -> str:
-    if not state.t - view.rise_t > _RESPONSE_TIME:
+    if not state.t - view.rise_t > view.response_time:
         return ""
     return (
         f"the commanded force rose to {state.goal.force:.1f} N, but the measured force stayed at "

@@ -110,6 +110,16 @@ def test_the_force_does_not_drift_during_a_long_hold(tip, seconds, error):
         assert [kind for level, kind, _ in hand.events if level != "info"] == []
 
 
+@pytest.mark.parametrize("slow", [{"force_time": 2.0}, {"smooth_time": 1.0}])
+def test_a_slow_increase_of_the_force_is_no_fault(slow):
+    with watched({"control": slow}) as hand:
+        grasped(hand, 5.0, 5.0)
+        hand.command("grasp", force=10.0)
+        hand.run(3.0)
+        assert hand.state.fault == ""
+        assert hand.plant.force.mean() == pytest.approx(10.0, rel=KNOWN)
+
+
 @pytest.mark.parametrize("last", ["grasp", "rotate", "hold"])
 def test_removing_the_object_ends_the_grip(last):
     with watched({}) as hand:
