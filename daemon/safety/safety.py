@@ -47,7 +47,7 @@ class _Watch:
         self._ended = -math.inf
 
     def check_limit(
-        self, view: View, state: State, faults: dict[_Watch, str], warnings: list[Breach]
+        self, view: View, state: State, faults: set[_Watch], warnings: list[Breach]
     ) -> None:
         """Run the check, and record a violation that has lasted long enough."""
         limit = self.limit
@@ -56,7 +56,7 @@ class _Watch:
             if self.since < math.inf:
                 self.since = math.inf
                 self._ended = state.t
-                faults.pop(self, None)
+                faults.discard(self)
             if self.reported and state.t - self._ended > _REPEAT_TIME:
                 self.reported = False
             return
@@ -64,7 +64,7 @@ class _Watch:
         if state.t - self.since < self.lasts:
             return
         if limit.level == "fault":
-            faults[self] = found
+            faults.add(self)
         elif not self.reported:
             self.reported = True
             warnings.append(Breach(limit.name, found))
@@ -96,7 +96,7 @@ class Safety:
         # Keep the order of the table, because the first violation determines the name of the fault.
         self._faults = [watch for watch in watches if watch.limit.level == "fault"]
         self._turn = 0
-        self._found: dict[_Watch, str] = {}  # current violations of fault limits
+        self._found: set[_Watch] = set()  # fault limits that were violated when last checked
         self.must_hold = False  # True if a grip's goal must not change because frames are late
         self.warnings: list[Breach] = []  # new warnings, which the loop reports and removes
         self.limited: Counter[str] = Counter()  # number of ticks with a modified goal, per limit
@@ -122,7 +122,6 @@ class Safety:
         view.update(state)
         for watch in self._each_tick:
             watch.check_limit(view, state, found, self.warnings)
-        view.bad_goal = False
         if self._in_turn:
             self._turn = (self._turn + 1) % len(self._in_turn)
             self._in_turn[self._turn].check_limit(view, state, found, self.warnings)
@@ -132,11 +131,16 @@ class Safety:
         self.must_hold = gripping and self._has_sensors and late
         if self.must_hold:
             self._count("tactile.late")
+        breach = None
         if found:
             for watch in self._faults:
-                if watch in found and (gripping or not watch.limit.gripping):
-                    return Breach(watch.limit.name, found[watch])
-        return None
+                applies = watch in found and (gripping or not watch.limit.gripping)
+                # The violation may have ended since a limit was last checked in turn.
+                if applies and (text := watch.check(view, state, watch.limit.fraction)):
+                    breach = Breach(watch.limit.name, text)
+                    break
+        view.bad_goal = False
+        return breach
 
     def cause(self, state: State, gripping: bool = False) -> str:
         """Return the first fault that would block a command in ``state``, or "" if there is none.

@@ -103,6 +103,16 @@ def test_each_fault_is_detected_and_named(fault):
     assert judge.cause(state), "commands must be refused during the fault"
 
 
+@pytest.mark.parametrize("fault", ["hot", "brown-out", "stalled", "dead"])
+def test_a_limit_that_is_checked_in_turn_is_no_fault_once_its_cause_has_ended(fault):
+    judge, state = safety(), sound()
+    put(state, FAULTS[fault][0])
+    assert judged(judge, state, 2.5)[0] == FAULTS[fault][1]
+    well = sound()
+    later(well, state.t - well.t)
+    assert judge.judge(well) is None
+
+
 def test_limits_of_missing_servos_or_sensors_are_ignored():
     for missing, faults in (
         ("servos", ("stale", "alert", "past", "fast", "hot", "brown-out")),
