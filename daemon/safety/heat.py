@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.control.modes import GRIPPING_MODES
-from softfinger.daemon.control.state_machine import Control
+from softfinger.daemon.control.state_machine import Control, Gripping
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.types import FINGERS, State
@@ -125,7 +124,7 @@ class HeatWatch:
         state = self._state
         i = min(self._fingers, key=lambda k: state.heat[k].time_to_limit)
         left = state.heat[i].time_to_limit
-        if state.mode not in GRIPPING_MODES or left > self._limits.heat_warn:
+        if not isinstance(control.state, Gripping) or left > self._limits.heat_warn:
             self._error_reported = False
             return ""
         hot = self._limits.temperature_max

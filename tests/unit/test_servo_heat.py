@@ -195,6 +195,20 @@ def test_an_overheating_grip_is_eased_and_keeps_holding():
         assert hand.state.goal.force == pytest.approx(eased)
 
 
+@pytest.mark.parametrize(("seconds", "told"), [(0.1, False), (2.0, True)])
+def test_the_force_is_reduced_only_after_both_tips_have_touched_the_object(seconds, told):
+    with SimulatedDaemon({}) as hand:
+        hand.grasp(8.0)
+        hand.run(seconds)
+        watch = hand.loop._heat
+        for finger, heat in enumerate(hand.state.heat):
+            watch._square[finger], heat.time_to_limit = 4.0, 20.0
+        assert watch.act(hand.control) == ""
+        hand.run(2.0)
+        assert any("was reduced" in text for _, text in heat_events(hand)) == told
+        assert (hand.control.grip.commanded < 8.0) == told
+
+
 @pytest.mark.parametrize(
     ("action", "mode"),
     [
