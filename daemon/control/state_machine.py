@@ -301,9 +301,10 @@ class Control:
         float | None
             Target angle, limited to the range of this grip; None if no target has been set yet.
         """
-        repeated = isinstance(self.state, Gripping) and force == self.grip.commanded
-        if force is not None and not repeated:
-            self.grasp(force, is_streamed=True)
+        if force is not None:
+            same = min(force, self.grip.commanded_max) == self.grip.commanded
+            if not (same and isinstance(self.state, Gripping)):
+                self.grasp(force, is_streamed=True)
         state = self.state
         if angle is None:
             return None

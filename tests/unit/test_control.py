@@ -362,6 +362,19 @@ def test_force_and_angle_follow_a_stream_of_setpoints(rate):
         assert hand.plant.force.mean() > 15.0, "the grip must still react to a sudden load"
 
 
+def test_a_stream_above_the_force_limit_does_not_shorten_a_reduction():
+    with watched({}) as hand:
+        grasped(hand, 10.0)
+        hand.control.limit_force(5.0, 3.0)
+        for k in range(150):
+            hand.command("hold", force=10.0 + 0.01 * (k % 2))
+            hand.run(0.02)
+            if k == 75:
+                assert hand.control.grip.force.value == pytest.approx(7.5, abs=0.3)
+        hand.run(0.5)
+        assert hand.control.grip.force.value == 5.0
+
+
 @pytest.mark.parametrize(
     ("scene", "q_max", "mode"),
     [
