@@ -164,8 +164,10 @@ class View:
     def _follow_force(self, state: State) -> None:
         target, last = state.goal.force, self._target
         self._target = target
-        felt = 0.5 * (state.contacts[0].force + state.contacts[1].force)
-        if not (state.mode in GRIPPING_MODES and self.touched(state) and target > felt):
+        contacts = [state.contacts[i] for i in self.fingers]
+        felt = sum(contact.force for contact in contacts) / len(contacts)
+        in_grip = state.mode in GRIPPING_MODES and all(map(_touches, contacts))
+        if not (in_grip and target > felt):
             self.rise_t = math.inf
         elif target > (1.0 + _FORCE_RISE_MIN) * last and self.rise_t == math.inf:
             self.rise_t, self.rise_felt = state.t, felt

@@ -304,9 +304,12 @@ def test_each_faulty_channel_is_named():
     assert "current is 0.10 A, but its goal current is 0.20 A" in told["consistency.right_current"]
 
 
-def test_a_force_that_does_not_increase_as_commanded_is_a_fault():
-    judge, state = safety(), sound()
+@pytest.mark.parametrize("scene", [{}, {"fingers": ("left",)}, {"object_model": False}])
+def test_a_force_that_does_not_increase_as_commanded_is_a_fault(scene):
+    judge, state = safety(Settings.model_validate({"scene": scene})), sound()
     state.mode = "grasping"
+    state.object.valid = not scene
+    state.contacts[1].contact = "fingers" not in scene
     for force, felt, fault in ((5.0, 5.0, False), (10.0, 6.5, False), (20.0, 6.5, True)):
         state.goal.force = force
         state.contacts[0].force = state.contacts[1].force = felt
