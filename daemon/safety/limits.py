@@ -314,7 +314,7 @@ def _servos_hot(view: View, state: State, fraction: float, i: int) -> str:
     bound = fraction * view.limits.temperature_max
     if temperature < bound:
         return ""
-    return f"the {FINGERS[i]} servo is at {temperature:.0f} °C, above {bound:g} °C"
+    return f"the {FINGERS[i]} servo is at {temperature:.0f} °C, expected below {bound:g} °C"
 
 
 @Limit("servos.voltage", "supply voltage of a servo", "fault",

@@ -51,7 +51,11 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
         "servos: outdated readings from the left servo",
     ),
     "deaf": ({"reading.lost": 0b11}, "goal.lost", "goals do not reach the left and right servo"),
-    "hot": ({"reading.temperature.0": 71.0}, "servos.temperature", "the left servo is at 71 °C"),
+    "hot": (
+        {"reading.temperature.0": 70.0},
+        "servos.temperature",
+        "the left servo is at 70 °C, expected below 70 °C",
+    ),
     "brown-out": ({"reading.voltage.1": 9.2}, "servos.voltage", "9.2 V, expected 9.5 to 16.0 V"),
     "no frames": (
         {"contacts.0.t_arrival": OLD, "contacts.0.t_valid": OLD},

@@ -338,7 +338,7 @@ def test_a_hot_servo_is_a_fault_that_remains_until_it_has_cooled(make):
     heat = daemon.hand.servo_heat[1]
     heat.warm(70.6)
     advance_to(daemon, "fault", 1.0)
-    assert daemon.loop.state.fault == "the right servo is at 71 °C, above 70 °C"
+    assert daemon.loop.state.fault == "the right servo is at 71 °C, expected below 70 °C"
     assert "clear: the right servo is at 7" in refusal(daemon, "clear")
     heat.warm(50.0)
     daemon.loop.advance(1.0)
