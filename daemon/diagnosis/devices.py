@@ -17,6 +17,7 @@ import numpy as np
 from softfinger.daemon.clock import RealClock, emulated
 from softfinger.daemon.errors import ServoError, TactileError
 from softfinger.daemon.perception.calibration_file import (
+    Calibration,
     CalibrationFileError,
     Converter,
     calibration_for,
@@ -112,9 +113,14 @@ def _try_exchange(
     mode = reg.MODE_NUMBERS[settings.servos.mode]
     address = goal_address(mode, model, firmwares[0])
     held = [line.read(servo_id, address, GOAL_SIZE[mode]) for servo_id in ids]
-    limp = not any(each.table[reg.TORQUE_ENABLE] for each in found)
-    write, what = None, f"{EXCHANGE_COUNT} read cycles (no writes, because torque is on)"
-    if limp and len(set(firmwares)) == 1 and None not in held:
+    obstacles = {
+        "torque is on": any(each.table[reg.TORQUE_ENABLE] for each in found),
+        "the firmware versions differ": len(set(firmwares)) > 1,
+        "a goal register cannot be read": None in held,
+    }
+    reasons = " and ".join(reason for reason, applies in obstacles.items() if applies)
+    write, what = None, f"{EXCHANGE_COUNT} read cycles (no writes, because {reasons})"
+    if not reasons:
         group = GroupWrite(line.port, address, GOAL_SIZE[mode], ids)
         write = partial(group.send, [value for value in held if value is not None])
         what = f"{EXCHANGE_COUNT} read and write cycles"
@@ -217,6 +223,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
     sensor = make_sensor(settings, RealClock(), None, finger)
     assert sensor is not None
     try:
+        calibration = calibration_for(settings, finger)
         sensor.open()
     except TactileError as error:
         return Finding("FAIL", name, str(error))
@@ -234,7 +241,7 @@ def check_board(settings: Settings, finger: int) -> Finding:
     if lost:
         fix = "check the cable, and move other devices to another USB hub"
         return Finding("warn", name, f"{found}, but {lost} bytes were corrupted or lost", fix)
-    rest = 0.0 if frame is None else _rest(settings, finger, frame)
+    rest = 0.0 if frame is None else _rest(settings, calibration, frame)
     if rest > _REST_NOISE_RATIO * tactile.noise:
         text = (
             f"{found}, but half of the cells read {rest / 1e3:.1f} kPa or more without load "
@@ -250,13 +257,12 @@ def check_board(settings: Settings, finger: int) -> Finding:
     return Finding("pass", name, found)
 
 
-def _rest(settings: Settings, finger: int, frame: Frame) -> float:
+def _rest(settings: Settings, calibration: Calibration | None, frame: Frame) -> float:
     """Return the median pressure of all cells [Pa].
 
     The median is the pressure of an unloaded cell, because a contact loads fewer than half of the
     cells.
     """
-    calibration = calibration_for(settings, finger)
     scale = settings.tactile.pascal_per_count
     if calibration is None:
         return scale * float(np.median(frame.data))

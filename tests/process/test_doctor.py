@@ -156,7 +156,7 @@ def test_boards_are_checked(hands, capsys):
     assert lines[-1].endswith(" 0 failed")
 
 
-def test_a_tip_model_other_than_the_calibrated_one_is_reported(tmp_path):
+def test_a_tip_model_other_than_the_calibrated_one_is_reported(tmp_path, monkeypatch):
     def tips(**tip: Any) -> Settings:
         tactile = {"calibration": (str(tmp_path / "left.json"), "")}
         return Settings.model_validate({"tip": tip, "tactile": tactile})
@@ -175,6 +175,8 @@ def test_a_tip_model_other_than_the_calibrated_one_is_reported(tmp_path):
     assert devices.check_law(tips(physics="solid", poisson=0.45), 0).fix == "set tip.poisson"
     (tmp_path / "left.json").write_text("{}")
     assert devices.check_law(tips(), 0).status == "FAIL"
+    monkeypatch.setattr(devices, "make_sensor", Mock())
+    assert "left.json: " in devices.check_board(tips(), 0).text
 
 
 def test_a_missing_port_and_a_missing_servo_fail(hands, capsys):

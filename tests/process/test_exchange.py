@@ -55,6 +55,24 @@ def test_doctor_times_the_exchange_of_a_tick_without_changing_registers(running)
     assert [bus.memory(i)[: reg.REALTIME_TICK] for i in (0, 1)] == before
 
 
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({reg.TORQUE_ENABLE: 1}, "torque is on"),
+        ({reg.FIRMWARE_VERSION: 46}, "the firmware versions differ"),
+        (
+            {reg.TORQUE_ENABLE: 1, reg.FIRMWARE_VERSION: 46},
+            "torque is on and the firmware versions differ",
+        ),
+    ],
+)
+def test_doctor_states_why_it_writes_nothing(running, changed, reason):
+    bus = running(servos={"mode": "current-based position"})
+    for address, value in changed.items():
+        bus.servo(1).table.set(address, value)
+    assert f"read cycles (no writes, because {reason}): " in exchange(bus, 5.0).text
+
+
 def test_late_replies_fail_with_timings_and_suggested_settings(bus):
     bus.fault("delay=0.02")
     found = exchange(bus, 100.0, reply_timeout=1.0)
