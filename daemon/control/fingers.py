@@ -71,6 +71,11 @@ class Fingers:
             low, high = max(low, ends[0]), min(high, ends[1])
         return present_angle + min(low, 0.0), present_angle + max(high, 0.0)
 
+    def limited_angle(self, angle: float) -> float:
+        """Limit an object ``angle`` [rad] to `turning_range`."""
+        low, high = self.turning_range()
+        return min(max(angle, low), high)
+
     def turn_refusal(self, angle: float) -> str:
         """Return the reason why the object can't rotate to ``angle`` [rad], or "" if it can."""
         if not self.pose.valid:

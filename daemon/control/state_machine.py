@@ -115,6 +115,7 @@ class GraspCommand:
     force: float  # [N]
     is_streamed: bool  # True if the client streams the force
     angle: float | None = None  # target angle after the grasp has settled [rad]
+    limits_angle: bool = False  # True if `hold` set the angle, which is limited to the grip's range
 
 
 @dataclass
@@ -283,7 +284,7 @@ class Control:
         """Rotate the object to ``angle`` [rad]; during a grasp, wait until the grip has settled."""
         state = self.state
         if isinstance(state, Approaching | Pressing):
-            state.command.angle = angle
+            state.command.angle, state.command.limits_angle = angle, False
         elif isinstance(state, Gripping):
             self.grip.steer(self.fingers.pose.angle, angle)
             state.history.turn_end_reported = False
@@ -309,10 +310,9 @@ class Control:
         if angle is None:
             return None
         if isinstance(state, Approaching | Pressing):
-            state.command.angle = angle
+            state.command.angle, state.command.limits_angle = angle, True
         elif isinstance(state, Gripping):
-            low, high = self.fingers.turning_range()
-            angle = min(max(angle, low), high)
+            angle = self.fingers.limited_angle(angle)
             self.grip.steer(self.fingers.pose.angle, angle)
             self._change(state)
             return angle
@@ -491,6 +491,8 @@ class Control:
         history.settled_force, history.settled_angle = grip.commanded, grip.target_angle
         self._enter(Settled(history))
         if isinstance(state, Pressing) and (angle := state.command.angle) is not None:
+            if state.command.limits_angle:
+                angle = self.fingers.limited_angle(angle)
             if refusal := self.fingers.turn_refusal(angle):
                 self._warn("rotate", f"rotate: {refusal}")
             else:

@@ -163,6 +163,19 @@ def test_a_turn_requested_while_grasping_waits_for_the_grip_or_is_reported(angle
             assert hand.state.object.angle == pytest.approx(angle, abs=math.radians(0.3))
 
 
+def test_an_angle_streamed_while_grasping_is_limited_to_the_range_of_the_grip():
+    with watched({}) as hand:
+        hand.run(0.3)
+        hand.command("arm")
+        hand.run(0.2)
+        hand.command("hold", force=8.0, angle=1.2)
+        hand.run(3.0)
+        assert hand.mode == "holding"
+        assert hand.state.object.angle > 0.2
+        # The tips would slip beyond this angle.
+        assert [kind for level, kind, _ in hand.events if level != "info"] == ["slip"]
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_a_light_grip_is_kept_with_tips_of_different_stiffness(seed):
     off = (0.7, 1.3)
