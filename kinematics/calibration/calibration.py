@@ -407,6 +407,11 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
         c = unit(np.maximum(depth - offset, 1e-9), tilt)
         columns = np.stack([c.force, -c.force_d], axis=1) / load[:, None]
         modulus, shift = np.linalg.lstsq(columns, np.ones(len(load)), rcond=None)[0].tolist()
+        if not modulus > 0.0 or np.count_nonzero(depth > offset) < 3:
+            raise CalibrationError(
+                "modulus: the force does not increase with d as it does in a contact; check that "
+                "the tip touches the sensor"
+            )
         step = float(np.clip(shift / modulus, -5e-4, 5e-4))
         offset += step
         if abs(step) < 1e-9:

@@ -151,7 +151,10 @@ def _scaled(law: Material, factor: float) -> Material:
 def fit_tip(
     presses: Presses, tip: Fingertip, grid: SensorGrid, law: Material = _UNIT_MATERIAL
 ) -> TipFit:
-    """Fit the modulus and the zero offset of d for one ``tip`` model by the Gauss-Newton method."""
+    """Fit the modulus and the zero offset of d for one ``tip`` model by the Gauss-Newton method.
+
+    ``chi2`` is infinite if the fitted modulus is not positive.
+    """
     readings = presses.frames[presses.used]
     offset = 0.0
     for _ in range(6):
@@ -159,6 +162,8 @@ def fit_tip(
         slope = (presses.of(tip, grid, presses.d - offset + _STEP, law) - shape) / _STEP
         columns = np.stack([shape, -slope], axis=1)
         modulus, shift = np.linalg.lstsq(columns, readings, rcond=None)[0]
+        if not modulus > 0.0:
+            return TipFit(tip, float(modulus), offset, math.inf, law=law)
         step = float(np.clip(shift / modulus, -5e-4, 5e-4))
         if abs(step) < 1e-7:
             break
@@ -178,6 +183,7 @@ def compare_tips(
 ) -> list[TipFit]:
     """Fit spring and solid models of the tip; return the fits in order of quality, best first.
 
+    Models whose fitted modulus is not positive are omitted.
     Springs are fitted with a constant modulus. If ``material`` is nonlinear, springs are also
     fitted with the law of ``material``. For solid rubber, ν is a free parameter. Both base types
     are fitted with a frictionless face. The better base type is then also fitted with a sticking
@@ -191,9 +197,8 @@ def compare_tips(
     both = [_best_poisson(presses, tip, grid) for tip in (bonded, replace(bonded, base="lying"))]
     better = min(both, key=lambda fit: fit.chi2).tip
     fits += [*both, _best_poisson(presses, replace(better, face="sticking"), grid)]
-    return sorted(
-        (_with_errors(presses, each, grid, active) for each in fits), key=lambda fit: fit.chi2
-    )
+    fits = [_with_errors(presses, each, grid, active) for each in fits if each.chi2 < math.inf]
+    return sorted(fits, key=lambda fit: fit.chi2)
 
 
 def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:

@@ -292,13 +292,18 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
         ("modulus", {"d": [-0.001, 0.0]}, "the run does not contain any frames with d above 0"),
         ("centre", {"words": ["--theta", "nan"]}, "theta: found a value that is not finite"),
         ("curve", {"words": ["--d", "inf"]}, "d: found a value that is not finite"),
+        (
+            "law",
+            {"frames": np.zeros((3, N, N), np.uint16), "d": [0.002, 0.004, 0.006]},
+            "law: found a modulus of at most 0 for each tip model",
+        ),
     ],
 )
 def test_impossible_contacts_are_refused_in_one_line(step, known, told, tmp_path, capsys):
     words = known.pop("words", [])
     (tmp_path / "profile.toml").write_text(PROFILE)
     path = tmp_path / "run.npz"
-    np.savez(path, frames=MadeUp().press(0.003, frames=2), **known)
+    np.savez(path, **{"frames": MadeUp().press(0.003, frames=2), **known})
     file = tmp_path / "sensor.json"
     given = ["--config", str(tmp_path / "profile.toml"), "--recording", str(path), *words]
     assert main(["calibrate", step, str(file), *given, "--no-plot"]) == 1

@@ -172,6 +172,10 @@ def test_clipped_noise_far_from_the_contact_is_removed():
             lambda: fit_modulus([0.001, 0.002, 0.003], [0, 0, 0], [3, 2, 1], TIP),
             "does not increase",
         ),
+        (
+            lambda: fit_modulus([0.002, 0.004, 0.006], [0, 0, 0], [1.0, 1.0, 1.01], TIP),
+            "check that the tip touches the sensor",
+        ),
     ],
 )
 def test_uninformative_data_are_refused(call, told):

@@ -53,6 +53,17 @@ def test_the_true_tip_model_fits_best(tip):
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
 
 
+def test_tip_models_without_a_positive_modulus_are_omitted():
+    d, theta = (2e-3, 4e-3, 6e-3), np.radians([0.0, 30.0, 60.0]).tolist()
+    seen = np.stack(
+        [GRID.pressure(Fingertip(0.020), RUBBER, *pose) for pose in zip(d, theta, strict=True)]
+    )
+    presses = Presses(seen, np.array(d), np.array(theta), NOISE, np.ones(seen.shape, np.bool_))
+    (only,) = compare_tips(presses, 0.020, GRID, np.ones(GRID.shape, np.bool_))
+    assert only.tip.physics == "springs"
+    assert only.modulus == pytest.approx(0.25e6, rel=1e-3)
+
+
 @pytest.mark.extended
 def test_position_and_rotation_of_a_solid_tip_are_found_from_complete_frames():
     true = SensorGrid(32, 32, 0.058 / 32, centre=(1.3e-3, -0.8e-3), rotation=-2.0)

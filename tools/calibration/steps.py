@@ -295,6 +295,11 @@ def _law(step: Step) -> Done:
     presses = Presses(signed, d, theta, noise, live & ~step.saturated)
     material = make_material(settings.material)
     fits = compare_tips(presses, settings.tip.radius, grid, live, material)
+    if not fits:
+        raise CalibrationError(
+            "law: found a modulus of at most 0 for each tip model, expected forces that increase "
+            "with d; check the presses and their d"
+        )
     best, lines = fits[0], [_told(each) for each in fits]
     steps: dict[str, Any] = {"scales": None}
     wants: dict[str, str | float] = {"physics": best.tip.physics}
