@@ -465,7 +465,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
     Raises
     ------
     CalibrationError
-        If the hold is too short.
+        If the hold is too short, or if the tip is released.
     """
     at, load = np.asarray(t, np.float64), np.asarray(force, np.float64)
     if at.size < 8 or not load.max() > 0.0:
@@ -478,6 +478,12 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
             f"relaxation: the press was held for {at[-1] - at[held]:.1f} s, expected at least "
             f"{_HOLD_RATIO_MIN * max(times):g} s ({_HOLD_RATIO_MIN:g} times the longest time in "
             "tip.relaxation_times)"
+        )
+    # A strength is at most 1, so a held tip keeps at least this fraction of its force.
+    if not load[held:].min() > load.max() / (1 + len(times)):
+        raise CalibrationError(
+            f"relaxation: the force fell to {load[held:].min() / load.max():.0%} of its maximum, "
+            "expected a single press that is held until the last frame"
         )
     lasting = np.maximum(load, 0.0)
     lasting[held:] = load[-1]

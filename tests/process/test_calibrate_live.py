@@ -51,7 +51,9 @@ def live(tmp_path_factory):
     folder = tmp_path_factory.mktemp("live")
     bench = Bench()
     rig = Rig("cobs", folder, source=bench)
-    port = PROFILE.replace('"simulated"', f'"cobs"\nport = ["{rig.board.path}", "none"]')
+    # The board sends 320 frames in less than 2.8 s, which the default time constants require.
+    profile = f"tip.relaxation_times = [0.004, 0.03, 0.3]\n{PROFILE}"
+    port = profile.replace('"simulated"', f'"cobs"\nport = ["{rig.board.path}", "none"]')
     (folder / "profile.toml").write_text(port.replace('clock = "virtual"', 'clock = "real"'))
     patch = pytest.MonkeyPatch()
     patch.setattr(sys, "stdin", bench)

@@ -224,6 +224,7 @@ def test_the_calibration_of_another_sensor_is_refused(bench, tmp_path, tactile, 
         (["curve", "--recording", "rest.npz", "--force", "1", "2"], "2 values for 1 loads"),
         (["modulus", "--recording", "rest.npz"], "expected --d"),
         (["centre", "--recording", "rest.npz"], "press 1 did not produce a valid contact"),
+        (["relaxation", "--recording", "rest.npz", "rest.npz"], "found 2 presses, expected one"),
         (["tare", "--recording", "none.npz"], "No such file"),
         (
             ["tare", "--recording", "rest.npz", "--finger", "right"],

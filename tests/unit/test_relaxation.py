@@ -126,6 +126,15 @@ def test_too_short_a_hold_is_refused():
         fit_relaxation(t, np.ones_like(t), TIMES)
 
 
+@pytest.mark.parametrize("strength", [0.3, 2.0])
+def test_a_release_is_refused_but_not_a_strong_relaxation(strength):
+    t = np.arange(0.0, 8.0, 0.01)
+    force = np.clip(t / 0.1, 0.0, 1.0) * (1.0 + strength * np.exp(-t / TIMES[2]))
+    assert fit_relaxation(t, force, TIMES).strengths[2] == pytest.approx(strength, rel=0.1)
+    with pytest.raises(CalibrationError, match="the force fell to 0% of its maximum"):
+        fit_relaxation(t, np.where(t > 7.5, 0.0, force), TIMES)
+
+
 def grip(aware: bool, tip: dict[str, Any]) -> tuple[float, float, list[str]]:
     """Hold with 8 N; return the relative true forces after 1 s and at the end, and all warnings."""
     sections: dict[str, dict[str, Any]] = {name: dict(values) for name, values in tip.items()}
@@ -158,7 +167,7 @@ def test_undeclared_relaxation_does_not_raise_the_grip():
 def test_calibrate_finds_relaxation_in_a_frame_recording(tmp_path, capsys):
     profile = load(Path("sim"))
     grid = make_sensor_model(profile, 0).grid
-    t = np.arange(0.0, 5.0, 0.01)
+    t = np.arange(0.0, 5.0, 0.02)  # half of tactile.rate
     d = 0.004 * np.minimum(t / 0.2, 1.0)
     tip, material = make_tip(profile), make_material(profile.material)
     lasting = ContactTable.build(tip, material)(d, 0.0 * d).force
@@ -168,7 +177,7 @@ def test_calibrate_finds_relaxation_in_a_frame_recording(tmp_path, capsys):
     counts = [rho * p / profile.tactile.pascal_per_count
               for rho, p in zip(relaxation_factor, pressures, strict=True)]  # fmt: skip
     run, file = tmp_path / "press.npz", tmp_path / "left.json"
-    np.savez(run, frames=np.rint(counts).astype(np.uint16), d=d)
+    np.savez(run, frames=np.rint(counts).astype(np.uint16), d=d, t=t)
     assert main(["calibrate", "relaxation", str(file), "--recording", str(run)]) == 0
     said = capsys.readouterr().out
     found = [float(each) for each in re.findall(r"\d\.\d{3}", said.partition("[")[2])]

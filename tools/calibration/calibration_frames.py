@@ -45,10 +45,13 @@ class Loads:
         Counts, uint16 [k, rows, cols], for each load.
     truths
         Known values, float64 [loads], for each quantity.
+    t
+        Times of the frames [s], float64 [k], for each load.
     """
 
     frames: list[NDArray[np.uint16]]
     truths: dict[str, NDArray[np.float64]]
+    t: list[NDArray[np.float64]]
 
 
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
@@ -76,15 +79,19 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
             if wrong := pitch_difference(recording, sensor.pitch):
                 raise RecordingError(f"{path}: {wrong}")
         whole = runs[0]
-        if len(runs) == 1 and whole.truths:
+        if len(runs) == 1 and whole.truths and arguments.step != "relaxation":
             # If one recording contains the whole run, each frame with a contact is a separate load.
             used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
-            frames = [whole.counts[k : k + 1] for k in np.flatnonzero(used)]
-            return Loads(frames, {name: whole.truths[name][used] for name in whole.truths})
-        return Loads([each.counts for each in runs], _spread(given, len(runs)))
+            loads = [slice(k, k + 1) for k in np.flatnonzero(used)]
+            truths = {name: whole.truths[name][used] for name in whole.truths}
+            return Loads([whole.counts[k] for k in loads], truths, [whole.t[k] for k in loads])
+        return Loads(
+            [each.counts for each in runs], _spread(given, len(runs)), [each.t for each in runs]
+        )
     count = max([arguments.loads, 1, *(len(values) for values in given.values())])
     truths = _spread(given, count)
-    return Loads(_live(arguments, settings, sensor.finger, truths, count), truths)
+    frames, t = _live(arguments, settings, sensor.finger, truths, count)
+    return Loads(frames, truths, t)
 
 
 def _read(path: Path, tactile: TactileSettings, full: int) -> FrameRecording:
@@ -117,7 +124,8 @@ def _live(
     finger: str,
     truths: dict[str, Any],
     count: int,
-) -> list[NDArray[np.uint16]]:
+) -> tuple[list[NDArray[np.uint16]], list[NDArray[np.float64]]]:
+    """Return the counts and the times of the frames of each load."""
     clock = RealClock()
     loads = []
     with _opened(settings, clock, finger) as backend:
@@ -131,8 +139,9 @@ def _live(
                     continue
                 bring(arguments, told, {"load": k + 1, **load})
             frames = _fresh(backend, clock)
-            loads.append(np.stack([next(frames).data for _ in range(arguments.frames)]))
-    return loads
+            loads.append([next(frames) for _ in range(arguments.frames)])
+    counts = [np.stack([frame.data for frame in load]) for load in loads]
+    return counts, [np.array([frame.t_sample for frame in load]) for load in loads]
 
 
 def _while_pressed(
@@ -141,16 +150,16 @@ def _while_pressed(
     clock: RealClock,
     told: str,
     load: Mapping[str, float],
-) -> NDArray[np.uint16]:
+) -> list[Frame]:
     """Return the last frames before a load is applied, and ``--frames`` frames under the load."""
-    before: deque[NDArray[np.uint16]] = deque(maxlen=_BEFORE)
+    before: deque[Frame] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock)
     with ThreadPoolExecutor(1) as pool:
         brought = pool.submit(bring, arguments, told, {"load": 1, **load})
         while not brought.done():
-            before.append(next(frames).data)
+            before.append(next(frames))
         brought.result()
-    return np.stack([*before, *(next(frames).data for _ in range(arguments.frames))])
+    return [*before, *(next(frames) for _ in range(arguments.frames))]
 
 
 def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | str]) -> None:

@@ -421,9 +421,10 @@ def _told(fit: TipFit) -> str:
 
 
 def _relaxation(step: Step) -> Done:
-    frames = np.concatenate(step.loads.frames)
+    if (count := len(step.loads.frames)) > 1:
+        raise CalibrationError(f"relaxation: found {count} presses, expected one")
+    frames, t = step.loads.frames[0], step.loads.t[0] - step.loads.t[0][0]
     force = np.array([step.converter(frame).sum() for frame in frames]) * step.cell_area
-    t = np.arange(len(force)) / step.settings.tactile.rate
     found = fit_relaxation(t, force, step.settings.tip.relaxation_times)
     strengths = ", ".join(f"{each:.3f}" for each in found.strengths)
     line = (
