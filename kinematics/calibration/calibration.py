@@ -105,34 +105,51 @@ def noise_correlation(stack: FloatArray) -> tuple[FloatArray, float]:
 
     Correlations within four standard errors of zero are set to zero.
     """
-    n, rows, cols = stack.shape
+    n, *shape = stack.shape
     noise = stack - stack.mean(axis=0)
     std = noise.std(axis=0)
-    rests = (std > 0.0) & (std <= _UNREST_SIGMA * np.median(std))  # True for usable cells
+    rests = std > 0.0  # True for usable cells
+    if np.count_nonzero(rests) < 2:
+        return np.empty((0, 0)), 0.0
+    rests &= std <= _UNREST_SIGMA * np.median(std[rests])
+    cells = np.count_nonzero(rests)
     noise *= rests
-    common = noise.sum(axis=(1, 2)) / max(np.count_nonzero(rests), 1)
+    common = noise.sum(axis=(1, 2)) / cells
     noise -= common[:, None, None] * rests
-    own = float(noise.var())
-    noise /= np.where(rests, std, 1.0)
-    shape = rows + _LAG_MAX, cols + _LAG_MAX
-    power = (np.abs(np.fft.fft2(noise, shape)) ** 2).sum(axis=0)
-    products = np.fft.ifft2(power).real
-    # Average the correlation over both diagonal directions, i.e. over both signs of the column lag.
-    both = 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:_LAG_MAX, :_LAG_MAX]
-    pairs = (n - 1.0) * np.outer(rows - np.arange(_LAG_MAX), cols - np.arange(_LAG_MAX))
-    if rows < _LAG_MAX or cols < _LAG_MAX or not both[0, 0] > 0.0:
+    spread = float((noise**2).sum()) / ((n - 1) * cells)
+    if not spread > 0.0:
         return np.empty((0, 0)), float(common.std(ddof=1))
-    rho = both / pairs / (both[0, 0] / pairs[0, 0])
-    rho[np.abs(rho) < _SIGNIFICANT_SIGMA / np.sqrt(pairs)] = 0.0
+    lags = min(_LAG_MAX, *shape)
+    pairs = np.rint(_lagged_products(rests[None], lags))
+    weight = (n - 1.0) * np.maximum(pairs, 1.0)
+    raw = _lagged_products(noise / np.where(rests, std, 1.0), lags) / weight
+    raw /= raw[0, 0]
+    level = np.where(pairs > 0.0, _SIGNIFICANT_SIGMA / np.sqrt(weight), math.inf)
+    level[0, 0] = 0.0
+    twice = np.where(np.arange(lags) > 0, 2.0, 1.0)
+    # Subtracting the mean of all cells decreases the correlations. ``share`` is the variance of
+    # this mean without drift, divided by the variance of a cell.
+    share = 1.0 / cells
+    for _ in range(2):
+        rho = raw + share * (1.0 - raw)
+        rho[np.abs(rho) < level] = 0.0
+        share = max(float(twice @ (rho * pairs) @ twice), 0.0) / cells**2
+    own = spread * share / (1.0 - share)
     used = np.argwhere(rho != 0.0).max(axis=0) + 1
     rho = rho[: used[0], : used[1]]
-    twice = np.where(np.arange(max(used)) > 0, 2.0, 1.0)
-    together = float(twice[: used[0]] @ rho @ twice[: used[1]])
-    own *= max(together, 0.0) / (rows * cols)
-    drift = math.sqrt(max(float(common.var(ddof=1)) - own, 0.0))
-    if drift < _SIGNIFICANT_SIGMA * math.sqrt(own / n):
-        drift = 0.0
+    excess = float(common.var(ddof=1)) - own
+    drift = math.sqrt(excess) if excess > _SIGNIFICANT_SIGMA * own * math.sqrt(2.0 / n) else 0.0
     return (rho if rho.size > 1 else np.empty((0, 0))), drift
+
+
+def _lagged_products(stack: FloatArray | NDArray[np.bool_], lags: int) -> FloatArray:
+    """Sum the products of two cells of [n, rows, cols] over all pairs at each lag, [lags, lags].
+
+    The result is averaged over both signs of the column lag.
+    """
+    shape = [size + lags for size in stack.shape[1:]]
+    products = np.fft.ifft2((np.abs(np.fft.fft2(stack, shape)) ** 2).sum(axis=0)).real
+    return 0.5 * (products + np.roll(products[:, ::-1], 1, axis=1))[:lags, :lags]
 
 
 @dataclass(frozen=True)
