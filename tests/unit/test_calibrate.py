@@ -294,6 +294,16 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
         ("centre", {"words": ["--theta", "nan"]}, "theta: found a value that is not finite"),
         ("curve", {"words": ["--d", "inf"]}, "d: found a value that is not finite"),
         (
+            "modulus",
+            {"d": [0.002, 0.004], "words": ["--theta", "95"]},
+            "theta: found 95°, expected less than 90°",
+        ),
+        (
+            "curve",
+            {"d": [0.002, 0.004], "words": ["--force", "1", "2", "3"]},
+            "--force: found 3 values for 2 loads",
+        ),
+        (
             "law",
             {"frames": np.zeros((3, N, N), np.uint16), "d": [0.002, 0.004, 0.006]},
             "law: found a modulus of at most 0 for each tip model",

@@ -69,7 +69,7 @@ steps for a tip, in this order; each step except relaxation adds its result to F
 
 Frames are read from the profile's sensor, one load after the other, or from recordings: one file
 per load, or one .npz file of the whole run that contains d [m], theta [rad] and force [N] for each
-frame.
+frame. The values of --d, --theta and --force replace those of the file.
 If you have no test stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints

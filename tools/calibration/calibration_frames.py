@@ -81,9 +81,10 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
         whole = runs[0]
         if len(runs) == 1 and whole.truths and arguments.step != "relaxation":
             # If one recording contains the whole run, each frame with a contact is a separate load.
-            used = whole.truths["d"] > 0.0 if "d" in whole.truths else np.ones(len(whole.t), bool)
+            truths = whole.truths | _spread(given, len(whole.t))
+            used = truths["d"] > 0.0 if "d" in truths else np.ones(len(whole.t), bool)
             loads = [slice(k, k + 1) for k in np.flatnonzero(used)]
-            truths = {name: whole.truths[name][used] for name in whole.truths}
+            truths = {name: values[used] for name, values in truths.items()}
             return Loads([whole.counts[k] for k in loads], truths, [whole.t[k] for k in loads])
         return Loads(
             [each.counts for each in runs], _spread(given, len(runs)), [each.t for each in runs]

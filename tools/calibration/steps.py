@@ -95,7 +95,9 @@ class Step:
     def d(self) -> FloatArray:
         """Displacement at each load [m]. Raises CalibrationError if it is not known."""
         if "d" not in self.loads.truths:
-            raise CalibrationError(f"{self.arguments.step}: expected --d, or a run that contains d")
+            raise CalibrationError(
+                f"{self.arguments.step}: expected --d, or a single recording that contains d"
+            )
         return self.loads.truths["d"]
 
     @property
@@ -212,7 +214,7 @@ def _curve(step: Step) -> Done:
         d = truths.get("d")
         if d is None:
             raise CalibrationError(
-                "curve: expected --force or --d, or a run that contains force or d"
+                "curve: expected --force or --d, or a single recording that contains force or d"
             )
         # Use the profile's material to compute the force on the whole footprint.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
