@@ -20,6 +20,7 @@ _PRIOR_STD = (0.4, 0.4, 3.0)  # prior σ of rise and time (relative), and of amb
 _READING_ERROR = 0.4
 _STEP = 1.0  # s
 _RISE_MIN = 8.0  # minimum temperature rise of the case [°C]
+_RESIDUAL_MAX = 2.0  # maximum rms error of the readings [°C], five times the error of a reading
 _ITERATIONS = 12
 
 
@@ -59,13 +60,14 @@ def forecast(
     return np.array(out)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike) -> HeatFit:
     """Fit the thermal model to a hold that starts at room temperature.
 
     ``current`` [A] and ``reading`` [°C] are sampled at the times ``t`` [s]. ``law`` contains the
     constants of the servo model, which are known to within 40 %. The Gauss-Newton method fits the
     logarithms of the factors. Raises CalibrationError if the case temperature rises by less than 8
-    °C.
+    °C, if there is no current, or if the model does not fit the readings.
     """
     at, square, shown = (np.asarray(each, np.float64) for each in (t, np.square(current), reading))
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
@@ -74,6 +76,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
             f"heat: found a temperature rise of {warmed:.0f} °C, expected at least {_RISE_MIN:g} "
             "°C: hold the grip longer, or use more force"
         )
+    if not square.max() > 0.0:
+        raise CalibrationError("heat: found no current, expected a servo that measures its current")
     grid = np.arange(at[0], at[-1], _STEP)
     squares, readings = np.interp(grid, at, square), np.interp(grid, at, shown)
     prior = np.array([0.0, 0.0, shown[0]])
@@ -88,10 +92,17 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     x, off, steps = prior.copy(), rows(prior), np.array([1e-3, 1e-3, 1e-2])
     for _ in range(_ITERATIONS):
         slopes = np.stack([(rows(x + step) - off) / step.max() for step in np.diag(steps)], axis=1)
+        if not np.isfinite(slopes).all():
+            break
         x -= np.linalg.lstsq(slopes, off, rcond=None)[0]
         off = rows(x)
-    std = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
     rise, time = float(np.exp(x[0])), float(np.exp(x[1]))
     case = forecast(law, squares, rise, time, shown[0], x[2])
     residual = float(np.sqrt(np.mean((case - readings) ** 2)))
+    if not residual < _RESIDUAL_MAX:
+        raise CalibrationError(
+            f"heat: found a residual of {residual:.3g} °C, expected less than {_RESIDUAL_MAX:g} "
+            "°C; record one grip that starts with a cold servo"
+        )
+    std = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
     return HeatFit(rise, rise * float(std[0]), time, time * float(std[1]), float(x[2]), residual)

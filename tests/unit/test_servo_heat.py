@@ -13,6 +13,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.heat import set_law
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
+from softfinger.kinematics.calibration.calibration import CalibrationError
+from softfinger.kinematics.calibration.heat_fit import fit_heat
 from softfinger.kinematics.hand.servo_heat import (
     TIME_MAX,
     HeatState,
@@ -161,6 +163,27 @@ def test_a_hold_with_little_heating_is_refused(tmp_path, capsys):
     profile.write_text("")
     assert main(["calibrate", "heat", str(profile), "--recording", str(RECORDING)]) == 1
     assert "found a temperature rise of 0 °C, expected at least 8 °C" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("current", "rise", "told"),
+    [
+        (0.0, lambda t: 12.0 * (t > 300.0), "found no current"),
+        (1.0, lambda t: 12.0 * (t > 300.0), "found a residual of 3 °C, expected less than 2 °C"),
+        (1.0, lambda t: 40.0 * (1.0 - np.exp(-t / 20.0)), "found a residual of"),
+        (5.0, lambda t: 10.0 * (1.0 - np.exp(-t / 200.0)), "found a residual of"),
+    ],
+)
+def test_readings_that_the_heat_model_does_not_fit_are_refused(current, rise, told):
+    t = np.arange(0.0, HOLD, 0.5)
+    with pytest.raises(CalibrationError, match=told):
+        fit_heat(law(HeatState()).law, t, np.full_like(t, current), 25.0 + np.round(rise(t)))
+
+
+def test_readings_that_the_heat_model_fits_roughly_are_accepted():
+    run = recorded(ServoHeat(by_name("XM430-W350"), 1.25, 0.8, 0.8))
+    t, current, reading = run.values()
+    assert fit_heat(law(HeatState()).law, t, current, reading + 6.0 * (t > 300.0)).residual > 1.2
 
 
 def hot(force: float, seconds: float, **sections: dict[str, Any]) -> SimulatedDaemon:
