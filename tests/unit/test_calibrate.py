@@ -31,6 +31,8 @@ CENTRE = (0.9e-3, -0.6e-3)
 ROTATION = 0.35
 EXPONENT, FACTOR = 1.25, 6.0  # p = FACTOR · x^EXPONENT [Pa]
 NOISE = 1.0  # counts
+SATURATED = np.full((2, N, N), 4000, np.uint16)
+SATURATED[1, 4, 5] = 4095
 PROFILE = f"""
 servos.backend = "none"
 scene.fingers = ["left"]
@@ -302,6 +304,12 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
             "curve",
             {"d": [0.002, 0.004], "words": ["--force", "1", "2", "3"]},
             "--force: found 3 values for 2 loads",
+        ),
+        ("equilibrate", {"frames": SATURATED}, "equilibrate: load 1 saturates a cell"),
+        (
+            "curve",
+            {"frames": SATURATED, "words": ["--force", "1"]},
+            "curve: load 1 saturates a cell",
         ),
         (
             "law",

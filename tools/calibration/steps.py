@@ -195,7 +195,16 @@ def _tare(step: Step) -> Done:
     return step.result(tare=result), line, (Map("zero [counts]", found.zero), spread)
 
 
+def _refuse_saturation(step: Step) -> None:
+    for k in np.flatnonzero(step.saturated.any(axis=(1, 2))):
+        raise CalibrationError(
+            f"{step.arguments.step}: load {k + 1} saturates a cell, so it can't be used; reduce "
+            "the load"
+        )
+
+
 def _equilibrate(step: Step) -> Done:
+    _refuse_saturation(step)
     found = equilibrate(step.loads.frames, step.converter.zero)
     dead = int(np.count_nonzero(found.gain == 0.0))
     result = _kept(EquilibrateStep, found, dead=dead)
@@ -223,11 +232,7 @@ def _curve(step: Step) -> Done:
             for x, theta in zip(d, step.theta, strict=True)
         ]
         force = np.array([each.sum() * step.cell_area for each in pressures])
-    for k, saturated in enumerate(step.saturated):
-        if saturated.any():
-            raise CalibrationError(
-                f"curve: load {k + 1} saturates a cell, so its force can't be used; reduce the load"
-            )
+    _refuse_saturation(step)
     gains = step.calibration.equilibrate
     full = float(sensor.full_count) * max(map(max, gains.gain) if gains else [1.0])
     found = fit_curve(step.arguments.kind, step.readings, force, step.cell_area, full)
