@@ -117,6 +117,7 @@ class CobsDecoder(DelimitedDecoder):
         self._missed = 0
         self._seq: int | None = None
         self._ticks = 0
+        self._t = 0.0  # time at which the last packet was read [s]
         self._wraps = 0  # number of overflows of the board clock
 
     def parse(self, packet: bytearray, t: float) -> Decoded | None:
@@ -143,11 +144,12 @@ class CobsDecoder(DelimitedDecoder):
         if (rows, cols) != (self.rows, self.cols) or size != _HEADER.size + kind * rows * cols:
             self._reason = f"frames of {rows} × {cols} cells in {size} bytes"
             return None
-        steps = 1 if self._seq is None else (seq - self._seq - 1) % 65536 + 1
-        if steps > 32768:  # The sequence number has decreased, so the board has restarted.
-            steps = 1
+        elapsed = (ticks - self._ticks) % 2**32 * _TICK
+        # If the board clock is ahead of the local time by a second, the board has restarted.
+        restarted = self._seq is None or elapsed > t - self._t + 1.0
+        steps = 1 if restarted else (seq - self._seq - 1) % 65536 + 1
         self._missed += steps - 1
-        self._seq = seq
+        self._seq, self._t = seq, t
         # A smaller tick count means that the clock has wrapped around or that the board has
         # restarted. SensorClock detects restarts.
         self._wraps += ticks < self._ticks

@@ -84,6 +84,16 @@ def test_frames_have_numbers_and_times_and_losses_are_counted():
     assert again.steps == 1
 
 
+@pytest.mark.parametrize("seq", [1, 20000, 40000, 65535])
+def test_a_restart_is_not_counted_as_a_loss(seq):
+    decoder = CobsDecoder(2, 3)
+    counts = np.zeros((2, 3), np.uint16)
+    decoder.feed(encode(counts, seq, 0.01 * seq), 1.0)
+    assert decoder.feed(encode(counts, 0, 0.0), 4.0).steps == 1
+    assert decoder.feed(encode(counts, 100, 1.0), 5.0).steps == 100
+    assert decoder.counters()["missed"] == 99
+
+
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
