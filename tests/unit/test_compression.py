@@ -226,6 +226,8 @@ def machine(header: str, form: str, **more) -> list[str]:
         ("Time;Compressive displacement;Standard force\ns;mm;N", "0;{0:.4f};{1:.4f}"),
         ("displacement/mm\tforce/N", "{0:.4f}\t{1:.4f}"),
         ("d_mm,F_N", "{0:.4f},{1:.4f}"),
+        ("Extension [mm],Load [N],Strain [%]", "{0:.4f},{1:.4f},5"),
+        ("d [mm],F [N],note", '{0:.4f},{1:.4f},"first'),
     ],
 )
 def test_file_formats_of_testing_machines_are_read(tmp_path, capsys, header, form):
@@ -256,6 +258,7 @@ def test_file_formats_of_testing_machines_are_read(tmp_path, capsys, header, for
         ),
         ("d [mm],F [N]", "1,2\n1.1,many", "line 3: force: found 'many', expected a number"),
         ("d [mm],F [N]", "1,2\n1.1", "line 3: force: found '', expected a number"),
+        ('"d\n[mm]",F [N]', "1,2", "'d': found the unit 'mm]\"', expected one of mm"),
         ("strain [kPa],stress [kPa]", "1,2", "'strain [kPa]': found the unit 'kPa'"),
     ],
 )

@@ -77,7 +77,8 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
 
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
     semicolon. The unit of a column follows the column name, or is in a separate row below the
-    header. Other columns, empty lines and lines that begin with # are ignored.
+    header. Other columns, empty lines and lines that begin with # are ignored. A cell must not
+    contain a line break.
 
     Raises
     ------
@@ -94,8 +95,8 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     if not lines:
         raise CalibrationError(f"{path}: the file is empty, expected {_EXAMPLE}")
     separator = next((each for each in "\t;" if each in lines[0][1]), ",")
-    rows = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True)
-    header, *cells = ([cell.strip() for cell in row] for row in rows)
+    rows = (csv.reader([line], delimiter=separator, skipinitialspace=True) for _, line in lines)
+    header, *cells = ([cell.strip() for cell in next(row)] for row in rows)
     below = cells[0] if cells and not any(map(_is_number, cells[0])) else []
     columns = _columns(path, header, below)
     found: dict[str, list[float]] = {name: [] for name in columns}
@@ -188,7 +189,7 @@ def fit_files(
             "each file"
         )
     files = [read_csv(path) for path in paths]
-    if any("strain" in file for file in files):
+    if any({"strain", "stress"} <= file.keys() for file in files):
         if len(files) > 1 or settings.tip.physics != "springs":
             raise CalibrationError(
                 'law: strain and stress require a single file and tip.physics = "springs"'
