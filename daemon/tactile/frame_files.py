@@ -13,7 +13,7 @@ Supported files:
 Integer frames contain counts. Floating-point frames are in Pa and are converted with
 ``pascal_per_count``. A cell that is NaN in all frames counts as dead. Negative readings are set to
 0 if noise around a tared zero can explain them. Times are in seconds by default. Another unit is
-detected from the intervals between the times or, for Unix times, from the values.
+detected from the intervals between the times or, for Unix times, also from the values.
 """
 
 from __future__ import annotations
@@ -354,8 +354,11 @@ def _seconds(t: NDArray[Any], rate: float, notes: list[str]) -> FloatArray:
     if not steps.size:
         return since
     step = float(np.median(steps))
+    # A board clock that is interpreted as a date has an interval ratio of 10⁶.
+    longest = _INTERVAL_RATIO_MAX**2 / rate if t.dtype.kind == "i" else math.inf
     for factor in (1.0, *_UNITS):
-        if _DATE_RANGE[0] <= first * factor < _DATE_RANGE[1]:  # The times are dates.
+        # The times are dates, unless they are integers that would be too far apart.
+        if _DATE_RANGE[0] <= first * factor < _DATE_RANGE[1] and step * factor <= longest:
             break
     else:
         factor = _factor(t, step, rate)

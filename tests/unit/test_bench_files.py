@@ -309,6 +309,14 @@ def test_times_in_other_units_are_converted_and_reported_once(
     assert note.startswith(f"t: interpreted as {name}, which gives 0.01 s between frames")
 
 
+@pytest.mark.parametrize(("name", "factor"), [("µs", 1000), ("ns", 1_000_000)])
+def test_times_since_a_boot_half_an_hour_ago_are_not_dates(press, tmp_path, name, factor):
+    np.savez(tmp_path / "a.npz", frames=press, t=(STEPS + 2_000_000) * factor)
+    read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    assert read.t == pytest.approx(STEPS * 1e-3)
+    assert read.notes[0].startswith(f"t: interpreted as {name}, ")
+
+
 @pytest.mark.parametrize("key", ["t", "time", "timestamps"])
 @pytest.mark.parametrize("start", [0.0, 3600.0, 1.7e9])
 def test_times_in_seconds_are_not_changed(press, tmp_path, start, key):
@@ -325,12 +333,13 @@ def test_numpy_times_keep_their_unit(press, tmp_path):
         assert load_recording(tmp_path / f"{k}.npz", SCALE, 25.0).t == pytest.approx(STEPS * 1e-3)
 
 
-def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path):
-    np.savez(tmp_path / "a.npz", frames=press, t=np.arange(8) * 0.5)
+@pytest.mark.parametrize(("start", "step"), [(0.0, 0.5), (1_700_000_000, 60)])
+def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path, start, step):
+    np.savez(tmp_path / "a.npz", frames=press, t=start + np.arange(8) * step)
     read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
-    assert read.t.tolist() == (np.arange(8) * 0.5).tolist()
+    assert read.t.tolist() == (np.arange(8) * step).tolist()
     assert read.notes == (
-        "t: interpreted as seconds, which gives 0.5 s between frames, but tactile.rate "
+        f"t: interpreted as seconds, which gives {step} s between frames, but tactile.rate "
         "corresponds to 0.01 s",
     )
 
