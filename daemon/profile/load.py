@@ -132,8 +132,10 @@ def _examined(
     found += _without_words((*problems(settings), *_plugin_problems(settings)), unused)
     errors = []
     for problem in found:
-        key = problem.partition(":")[0].partition(" (")[0]  # without the name of a finger
-        errors.append(f"{'--set' if key in changed else name}: {problem}")
+        # A problem may name several keys, the index of a value, or a finger in parentheses.
+        keys = re.split("[:(]", problem)[0].strip().split(", ")
+        is_set = any(f"{key}.".startswith(f"{each}.") for key in keys for each in changed)
+        errors.append(f"{'--set' if is_set else name}: {problem}")
     return ExaminedProfile(name, settings, errors, unused)
 
 
@@ -296,6 +298,8 @@ def _line(
         return f"{key}: unknown key{nearest(location[-1], _fields(inside[:-1], model))}"
     if details["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return f"{key}: found {shown(details['input'])}, expected a table"
+    if details["type"] == "missing":
+        return f"{key}: not found in {shown(details['input'])}, expected a value"
     expected = _MESSAGE_START.sub("", details["msg"], count=1)
     if details["type"] == "less_than_equal" and not above and _is_length(location):
         metres = 1e-3 * float(details["input"])

@@ -1,6 +1,7 @@
 """Test that profiles are loaded, and that all errors of a profile are listed at once."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -339,6 +340,21 @@ def test_command_line_changes_override_the_file_and_are_checked_with_it(tmp_path
     real = ["servos.backend=dynamixel", "tactile.backend=flexitac"]
     with pytest.raises(SettingsError, match=r"^--set: tactile\.port \(right\): found \"/dev/a\""):
         load(changes=[*real, 'tactile.port=["/dev/a", "/dev/a"]'])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("servos.ids=[1,300]", "servos.ids.1: found 300, expected less than or equal to 252"),
+        ("servos.backend=dynamixel", "servos.backend, tactile.backend: found dynamixel and"),
+        ("tip.relaxation=[1,1]", "tip.relaxation.2: not found in [1, 1], expected a value"),
+    ],
+)
+def test_a_change_is_named_as_the_cause_of_its_errors(tmp_path, change, told):
+    file = tmp_path / "my.toml"
+    file.write_text("servos.ids = [1, 2]\n")
+    with pytest.raises(SettingsError, match=f"^--set: {re.escape(told)}"):
+        load(file, changes=[change])
 
 
 @pytest.mark.parametrize("change", ["loop.rate", "rate=3", "=", ".=1", "loop.=1", "loop.rate.x=1"])
