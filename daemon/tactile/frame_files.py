@@ -249,6 +249,8 @@ def _checked(
         live = arrays["live"].astype(np.bool_)
         if live.shape != frames.shape[1:]:
             raise ValueError(f"live: found shape {live.shape}, expected {frames.shape[1:]}")
+        if not live.any():
+            raise ValueError("live: found only False, expected True for each cell of the sensor")
     whole = frames.dtype.kind != "f"
     scale = 1.0 if whole else scale
     frames, live = _without_dead(frames, live, _COUNT_MAX * scale)

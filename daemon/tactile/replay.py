@@ -72,11 +72,13 @@ class ReplayTactile:
     """Backend that replays a recording at its recorded times, starting when ``open`` is called.
 
     The recording restarts one mean frame interval after the last frame. If ``tactile.replay_again``
-    is false, the last frame is repeated once with ``valid`` False, and the replay ends. ``live``
-    [rows, cols] is False where the recording has no cell. ``full_count`` is the reading of
-    saturated cells, or None if the recording does not state it. ``notes`` describes suspicious
-    properties of the recording.
+    is false, the last frame is repeated once with ``valid`` False, and the replay ends. ``error``
+    states this reason. ``live`` [rows, cols] is False where the recording has no cell.
+    ``full_count`` is the reading of saturated cells, or None if the recording does not state it.
+    ``notes`` describes suspicious properties of the recording.
     """
+
+    error = "the recording has ended, and tactile.replay_again is false"
 
     def __init__(self, settings: TactileSettings, clock: Clock, finger: int) -> None:
         """Load the recording.

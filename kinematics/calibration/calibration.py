@@ -435,7 +435,7 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
             break
     fitted = modulus * unit(np.maximum(depth - offset, 1e-9), tilt).force
     errors = fitted / load - 1.0
-    alone = trend(depth, modulus / (1.0 + errors), load)
+    alone = trend(depth, modulus / (1.0 + errors), load, tip.physics)
     return Modulus(modulus, offset, errors, _rms(errors), alone)
 
 

@@ -78,8 +78,8 @@ def fit_friction(
     Raises
     ------
     CalibrationError
-        If the joint moves for less than 0.5 s in either direction, or if the data are longer than
-        an hour.
+        If the joint moves for less than 0.5 s in either direction, if the samples are 35 ms or more
+        apart, or if the data are longer than an hour.
     """
     at, angle, led, given = (np.asarray(each, np.float64) for each in (t, q, goal, torque))
     if at.size and at[-1] - at[0] > DURATION_MAX:
@@ -94,6 +94,11 @@ def fit_friction(
     # Use a sample only if the direction of motion is constant throughout its smoothing window.
     closes, opens = (_throughout(whole & (sign * rate > _SLIDING_SPEED)) for sign in (1.0, -1.0))
     seconds = [float(np.count_nonzero(each)) * _STEP for each in (closes, opens)]
+    if (interval := float(np.median(np.diff(at)))) >= _GAP_MAX:
+        raise CalibrationError(
+            f"found a state every {interval * 1e3:.0f} ms, expected less than "
+            f"{_GAP_MAX * 1e3:.0f} ms between states: increase stream.state_rate"
+        )
     if min(seconds) < _MOTION_TIME_MIN:
         raise CalibrationError(_too_little(*seconds))
     used = closes | opens

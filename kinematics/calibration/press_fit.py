@@ -64,13 +64,14 @@ class Trend:
 
     A line is fitted to E as a function of d. ``drift`` is the relative change of the line from the
     minimum to the maximum d. ``std`` is the standard deviation of ``drift``, based on the scatter
-    about the line.
+    about the line. ``physics`` is the physics of the fitted tip.
     """
 
     d: FloatArray
     modulus: FloatArray
     drift: float
     std: float
+    physics: str
 
     @property
     def drifts(self) -> bool:
@@ -79,16 +80,16 @@ class Trend:
 
     @property
     def cause(self) -> str:
-        """Probable cause of the drift."""
-        if self.drift > 0.0:
-            return "the tip stiffens more than the model; try a different base or face, or springs"
-        return (
-            "the tip softens, or stiffens less than the model; try a different base or face, or "
-            "solid"
+        """Probable cause of the drift, and models that may fit better."""
+        more = "stiffens more" if self.drift > 0.0 else "softens, or stiffens less"
+        solid = self.physics == "solid"
+        other = (
+            "a different base or face, or springs" if solid else "solid, or another material law"
         )
+        return f"the tip {more} than the model; try {other}"
 
 
-def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
+def trend(d: FloatArray, modulus: FloatArray, force: FloatArray, physics: str) -> Trend:
     """Fit a line to ``modulus`` [n] [Pa] versus ``d`` [n] [m], weighted by ``force`` [n]."""
     weight = force / force.max()
     span = np.ptp(d)
@@ -97,7 +98,7 @@ def trend(d: FloatArray, modulus: FloatArray, force: FloatArray) -> Trend:
     left = weight * modulus - rows @ (start, gain)
     variance = float(left @ left) / max(len(d) - 2, 1) * np.linalg.inv(rows.T @ rows)[1, 1]
     middle = start + 0.5 * gain
-    return Trend(d, modulus, float(gain / middle), math.sqrt(variance) / abs(middle))
+    return Trend(d, modulus, float(gain / middle), math.sqrt(variance) / abs(middle), physics)
 
 
 def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | None:
@@ -238,7 +239,7 @@ def _with_errors(
     d, shown, seen = presses.d[pressed], shapes[pressed], presses.frames[pressed]
     if np.ptp(d) > 0.0:
         alone = (shown * seen).sum(axis=(1, 2)) / (shown**2).sum(axis=(1, 2))
-        fit = replace(fit, trend=trend(d, alone, shown.sum(axis=(1, 2))))
+        fit = replace(fit, trend=trend(d, alone, shown.sum(axis=(1, 2)), fit.tip.physics))
     errors = []
     for frame, used, d, theta in zip(
         presses.frames, presses.used, presses.d - fit.offset, presses.theta, strict=True

@@ -122,6 +122,16 @@ def test_missing_loads_change_nothing(tmp_path, capsys, monkeypatch):
     assert not file.exists()
 
 
+def test_the_end_of_a_replay_is_reported(tmp_path, capsys, monkeypatch):
+    np.savez(tmp_path / "rest.npz", frames=MadeUp().counts(np.zeros((N, N)), 3))
+    monkeypatch.setattr(calibration_frames, "RealClock", VirtualClock)
+    profile = tmp_path / "replay.toml"
+    replay = f'"replay"\nreplay_again = false\nrecording = ["{tmp_path / "rest.npz"}", ""]'
+    profile.write_text(PROFILE.replace('"simulated"', replay))
+    assert main(["calibrate", "tare", str(tmp_path / "a.json"), "--config", str(profile)]) == 1
+    assert "the sensor stopped sending: the recording has ended" in capsys.readouterr().err
+
+
 def test_without_matplotlib_the_step_succeeds_and_reports_the_missing_plot(
     live, tmp_path, capsys, monkeypatch
 ):

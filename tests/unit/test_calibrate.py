@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from softfinger.daemon.wire.schema import TACTILE
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
+from softfinger.tools.calibration import calibrate
 from softfinger.tools.cli import main
 from tests.harness.golden_wire import message_maker
 
@@ -242,6 +244,16 @@ def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, 
     assert main(["calibrate", step, str(folder / "sensor.json"), *words]) == 1
     assert told in capsys.readouterr().err
     assert (folder / "sensor.json").read_bytes() == before
+
+
+def test_a_gain_that_no_grip_has_measured_is_refused(tmp_path, capsys, monkeypatch):
+    contact = SimpleNamespace(sensor_gain=0.5, sensor_gain_std=0.15)
+    monkeypatch.setattr(calibrate, "_last_state", lambda _: SimpleNamespace(left=contact))
+    assert main(["calibrate", "scales", str(tmp_path / "left.json")]) == 1
+    assert (
+        "found a gain of 0.50 ± 0.15, expected a standard deviation of less than 20% of the gain"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,8 @@ def test_torque_independent_of_direction_is_not_friction():
     closing = np.maximum.accumulate(q[t < 4.0])
     with pytest.raises(CalibrationError, match=r"0\.\d s of closing motion and 0\.0 s of opening"):
         fit_friction(t[t < 4.0], closing, closing, shown[t < 4.0], 0.010, COUNT)
+    with pytest.raises(CalibrationError, match=r"found a state every 40 ms.*stream\.state_rate"):
+        fit_friction(t[::4], q[::4], q[::4], shown[::4], 0.010, COUNT)
     with pytest.raises(CalibrationError, match=r"found 0\.0 s of closing"):
         fit_friction([], [], [], [], 0.010, COUNT)
 

@@ -98,6 +98,8 @@ def test_deep_contacts_of_other_elements_give_one_modulus(base):
         (TIP, TIP, 0),
         (TIP, Fingertip(0.020, "solid", 0.48, "lying"), 1),
         (Fingertip(0.020, "solid", 0.48, "lying"), TIP, -1),
+        (Fingertip(0.020), TIP, -1),
+        (TIP, Fingertip(0.020), 1),
     ],
 )
 def test_a_modulus_fitted_with_the_wrong_law_varies_with_depth(made, fitted, sign):
@@ -109,6 +111,7 @@ def test_a_modulus_fitted_with_the_wrong_law_varies_with_depth(made, fitted, sig
     if sign:
         assert np.sign(found.trend.drift) == sign
         assert ("more than" in found.trend.cause) == (sign > 0)
+        assert fitted.physics not in found.trend.cause  # This physics has already been tried.
     assert found.trend.d == pytest.approx(d)
     assert found.trend.modulus == pytest.approx(found.modulus / (1.0 + found.errors), rel=1e-12)
 

@@ -106,6 +106,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
         ({"frames": FRAMES, "t": np.arange(4)}, "5 numbers"),
         ({"frames": FRAMES, "d": np.full(5, np.nan)}, "d: found a number that is not finite"),
         ({"frames": FRAMES, "live": np.ones(3)}, "live: found shape"),
+        ({"frames": FRAMES, "live": np.zeros((4, 6), bool)}, "live: found only False"),
         ({"frames": np.array([{}], dtype=object)}, "run.npz"),
     ],
 )

@@ -234,10 +234,11 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     calibration = begin(arguments, settings)
     state = _last_state(arguments)
     contact = getattr(state, arguments.finger)
-    if not contact.sensor_gain_std < _LEARNT * settings.tactile.gain_error * contact.sensor_gain:
+    error, limit = contact.sensor_gain_std, _LEARNT * settings.tactile.gain_error
+    if not error < limit * contact.sensor_gain:
         raise CalibrationError(
-            f"scales: found a gain uncertainty of {contact.sensor_gain_std:.2f}, expected less "
-            f"than {_LEARNT * settings.tactile.gain_error:.2f}: first grasp an object firmly"
+            f"scales: found a gain of {contact.sensor_gain:.2f} ± {error:.2f}, expected a standard "
+            f"deviation of less than {limit:.0%} of the gain: first grasp an object firmly"
         )
     step = ScalesStep(
         date=now(),
