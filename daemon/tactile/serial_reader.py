@@ -193,7 +193,6 @@ class SerialReader:
             try:
                 data = os.read(port, _READ_SIZE)
             except BlockingIOError:
-                timeout = None
                 continue
             except OSError as error:
                 return self._end(f"the port is lost ({os.strerror(error.errno or errno.EIO)})")

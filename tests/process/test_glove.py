@@ -1,6 +1,7 @@
 """Test the decoder for glove-style framing, and the polling of a board on a real pty."""
 
 import itertools
+import os
 
 import numpy as np
 import pytest
@@ -100,3 +101,21 @@ def test_each_frame_is_requested_and_requested_again_after_a_lost_reply(tmp_path
         # The board sends data only on request.
         assert rig.board.sent <= counters["frames"] + counters["resyncs"] + 3
         assert rig.board.dropped == 0
+
+
+def test_a_frame_whose_bytes_another_process_has_read_is_requested_again(tmp_path, monkeypatch):
+    with Rig("glove", tmp_path) as rig:
+        rig.sensor.open()
+        port, read, taken = rig.sensor._port.fileno(), os.read, []
+
+        def take(file, size):
+            data = read(file, size)
+            if file == port and not taken:
+                taken.append(data)
+                raise BlockingIOError
+            return data
+
+        monkeypatch.setattr(os, "read", take)
+        until(lambda: taken)
+        first = rig.sensor.latest().seq
+        until(lambda: rig.sensor.latest().seq >= first + 5)
