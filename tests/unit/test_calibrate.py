@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,10 +17,11 @@ from softfinger.daemon.perception.calibration_file import (
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.schema import TACTILE
+from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.calibration import calibrate
+from softfinger.tools.calibration import calibrate, calibration_frames
 from softfinger.tools.cli import main
 from tests.harness.golden_wire import message_maker
 
@@ -244,6 +246,12 @@ def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, 
     assert main(["calibrate", step, str(folder / "sensor.json"), *words]) == 1
     assert told in capsys.readouterr().err
     assert (folder / "sensor.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["true {d.mm}", "true {d[0]}", "true {x}", "true {d", "true '"])
+def test_an_invalid_move_command_is_reported(command):
+    with pytest.raises(CalibrationError, match=f"^--move: {re.escape(command)}: "):
+        calibration_frames.bring(SimpleNamespace(move=command), "apply load 1", {"load": 1})
 
 
 def test_a_gain_that_no_grip_has_measured_is_refused(tmp_path, capsys, monkeypatch):

@@ -73,11 +73,11 @@ frame. The values of --d, --theta and --force replace those of the file.
 If you have no test stage, try the steps on `softfinger emulate`:
   --move "softfinger emulate --send 'press depth={d}mm tilt={theta}deg'"
   --move "softfinger emulate --send 'turn {finger}={pose}'"     for joints
-If matplotlib is installed, each step plots its result and residuals in FILE.STEP.png (law: only
-with --compression).
-Steps depend on earlier steps: repeating equilibrate removes the results of curve, modulus and
-scales; repeating curve removes the results of modulus and scales; repeating modulus removes the
-result of scales.
+If matplotlib is installed, the results of tare, equilibrate, curve, centre, modulus, law (only with
+--compression) and relaxation are plotted in FILE.STEP.png.
+Steps depend on earlier steps: repeating equilibrate removes the results of curve, modulus, law and
+scales; repeating curve removes the results of modulus, law and scales; repeating modulus or law
+removes the result of scales.
 """
 
 

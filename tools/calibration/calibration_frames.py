@@ -180,7 +180,14 @@ def _move(command: str, load: Mapping[str, float | str]) -> None:
             for word in shlex.split(command)
         ]
         done = subprocess.run(words, stdin=subprocess.DEVNULL, timeout=_WAIT).returncode
-    except (LookupError, ValueError, OSError, subprocess.TimeoutExpired) as error:
+    except (
+        LookupError,
+        ValueError,
+        AttributeError,
+        TypeError,
+        OSError,
+        subprocess.TimeoutExpired,
+    ) as error:
         raise CalibrationError(f"--move: {command}: {error}") from None
     if done != 0:
         raise CalibrationError(f"--move: {command}: the program exited with status {done}")
