@@ -1,7 +1,11 @@
 """Read boards with COBS framing, a format for custom boards and for sensors of 44 × 44 cells.
 
-Any baud rate is allowed, and USB boards may ignore the baud rate. The firmware sends each scan
-without a request, in four steps:
+Any baud rate is allowed. A USB board may ignore the baud rate, but ``tactile.baud`` must then be
+the actual transfer rate (10 bits per byte), because the reader subtracts the transfer time of each
+frame from its arrival time. The board clock needs a quartz: if it is more than 200 ppm slower than
+the computer's clock, the frame times become increasingly late.
+
+The firmware sends each scan without a request, in four steps:
 
 1. Build the message with all numbers in little-endian order:
 
