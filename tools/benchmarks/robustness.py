@@ -56,6 +56,7 @@ class HandCase:
     load: float = 0.0  # load along the faces [N]
     within: float = 0.0  # duration of the load ramp [s]
     turn: float = 0.0  # commanded object angle [rad]
+    tares: bool = False  # True if the sensors are tared before the grip
     false: tuple[str, ...] = ()  # channels that may be reported as faulty
 
 
@@ -199,7 +200,8 @@ def sensor_grips(sensor: str) -> Iterator[HandCase]:
         force = (4.0, 8.0, 12.0)[k % 3]
         torque = chance.uniform(0.9, 1.1)
         hand, turn = _hand(seed=k, object_mass=mass), math.copysign(_TURN, k % 2 - 0.5)
-        yield HandCase(name, force, hand, SENSORS.get(sensor, {}), torque, turn=turn)
+        daemon = SENSORS.get(sensor, {})
+        yield HandCase(name, force, hand, daemon, torque, turn=turn, tares=True)
 
 
 @dataclass
@@ -233,6 +235,9 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
     daemon = merged({"simulation": {"seed": seed}}, case.daemon)
     with VirtualGrip(daemon, merged(case.hand, daemon), case.torque) as hand:
         loop, state = hand.loop, hand.state
+        if case.tares:
+            hand.command("tare")
+            loop.advance(0.5)
         hand.command("arm")
         loop.advance(0.1 + chance.uniform(0.0, 0.02))
         watch, begin = Watch(case.force, _EXCESS_RATIO), state.t
