@@ -287,14 +287,23 @@ def test_messages_sent_before_the_end_are_written(addresses, tmp_path):
     assert seqs == list(range(4000))
 
 
-def test_split_files_are_contiguous(fake, tmp_path):
+def test_split_files_are_contiguous_and_contain_the_settings(fake, tmp_path):
     path = tmp_path / "run.mcap"
+    files = [path, *(tmp_path / f"run-{number}.mcap" for number in range(2, 5))]
+    fake.silent.set()
     process = record(path, "--address", fake.state_address, "--split-time", "0.2")
-    files = [path, tmp_path / "run-2.mcap", tmp_path / "run-3.mcap"]
+    settings = pack(sample(schema.SETTINGS))
+    until(lambda: fake.send(schema.SETTINGS, settings) or files[1].exists())
+    fake.silent.clear()
     until(files[-1].exists)
-    assert interrupted(process)[0] == 0
-    seqs = [m["seq"] for file in files for _, m in Recording(file).messages([schema.STATE])]
+    status, out, _ = interrupted(process)
+    assert status == 0
+    files = sorted(tmp_path.iterdir(), key=lambda file: (len(file.name), file.name))
+    read = [list(Recording(file).messages()) for file in files]
+    seqs = [m["seq"] for each in read for topic, m in each if topic == schema.STATE]
     assert seqs == list(range(seqs[0], seqs[-1] + 5, 5))
+    assert all(schema.SETTINGS in dict(each) for each in read)
+    assert f"{sum(map(len, read))} messages written; lost: " in out
 
 
 def test_the_recorder_waits_for_a_daemon_except_with_no_wait(addresses, tmp_path):

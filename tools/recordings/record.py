@@ -46,7 +46,8 @@ from softfinger.tools.stop_condition import StopCondition
 _EPILOG = """\
 Recording ends on Ctrl-C or after --duration; the numbers of written and lost messages are then
 printed.
-With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mcap and so on.
+With --split-size or --split-time, recording continues in FILE-2.mcap, FILE-3.mcap and so on. Each
+file contains the settings.
 `replay --recompute` requires --topics all; `run --record` records all topics from the first tick.
 Exit status: 0 all messages were written; 1 messages were not written (the reason is printed)."""
 
@@ -252,7 +253,9 @@ class _Recorder:
         # The last writer in this list is the active writer.
         self._writers = [RecordingWriter(arguments.file)]
         self._opened = time.monotonic()
-        self._messages = 0  # number of received messages that are to be written
+        # Number of messages that are to be written, including the repeated settings.
+        self._messages = 0
+        self._settings: dict[str, Any] | None = None  # newest settings, marked as repeated
         self._unreadable = 0
         self._waiting = False  # True once the notice about the missing stream has been printed
 
@@ -333,6 +336,8 @@ class _Recorder:
             self._unreadable += 1
             return
         if self._gaps.setdefault(topic, Gaps()).take(message):
+            if topic == schema.SETTINGS:
+                self._settings = message | {"again": True}
             self._split_if_due()
             self._writers[-1].add(topic, message)
             self._messages += 1
@@ -350,6 +355,10 @@ class _Recorder:
         self._writers.append(RecordingWriter(path))
         self._opened = time.monotonic()
         writer.close()
+        # Each file must contain the settings, so that it can be analysed without the first file.
+        if self._settings is not None:
+            self._writers[-1].add(schema.SETTINGS, dict(self._settings))
+            self._messages += 1
 
     def _show(self, elapsed: float, silent: float) -> None:
         if not sys.stderr.isatty():
@@ -375,7 +384,7 @@ class _Recorder:
         lost = ", ".join(
             f"{gaps.lost} of {topic.decode()}" for topic, gaps in self._gaps.items() if gaps.lost
         )
-        received = f" of {self._messages} received" if self._messages > written else ""
+        received = f" of {self._messages}" if self._messages > written else ""
         print(f"{written} messages written{received}; lost: {lost or 'none'}")
         if self._unreadable:
             print(f"{self._unreadable} messages could not be read and were skipped")
