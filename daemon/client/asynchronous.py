@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import zmq
 import zmq.asyncio
 
 from softfinger.daemon.client.command_client import (
+    IS_DONE,
     RETRY_DELAY,
     Attempts,
     HandClient,
+    NoAnswer,
     accepted,
-    is_done,
     send_once,
 )
 from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
@@ -148,8 +150,11 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         try:
             await self.command(command, **numbers)
         except Refused:
-            if not is_done(command, await self.status()):
-                raise
+            if command in IS_DONE:
+                with suppress(NoAnswer, Refused):
+                    if IS_DONE[command](await self.status()):
+                        return
+            raise
 
     async def status(self) -> dict[str, Any]:
         """Return the mode, the fault, the torque state, and the servo and sensor counters."""

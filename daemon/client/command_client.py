@@ -6,6 +6,7 @@ import logging
 import math
 import secrets
 import time
+from collections.abc import Callable
 from numbers import Real
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -162,14 +163,13 @@ def accepted(reply: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in reply.items() if key != "ok"}
 
 
-def is_done(command: str, status: dict[str, Any]) -> bool:
-    """Return True if the hand is already in the state that ``command`` would produce."""
-    mode = status.get("mode", "fault")
-    if command == "arm":
-        return mode not in ("disarmed", "fault")
-    if command == "disarm":
-        return status.get("torque") is False
-    return command == "clear" and mode != "fault"
+# Functions that return True if the status shows the state that the command would produce. For these
+# commands, a refusal is then ignored.
+IS_DONE: dict[str, Callable[[dict[str, Any]], bool]] = {
+    "arm": lambda status: status.get("mode", "fault") not in ("disarmed", "fault"),
+    "disarm": lambda status: status.get("torque") is False,
+    "clear": lambda status: status.get("mode", "fault") != "fault",
+}
 
 
 class HandClient(Generic[_Done]):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any, Self, TypeVar
 
-from softfinger.daemon.client.command_client import HandClient, accepted, is_done, send
+from softfinger.daemon.client.command_client import IS_DONE, HandClient, NoAnswer, accepted, send
 from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
@@ -170,8 +171,11 @@ class Hand(HandClient[None]):
         try:
             self.command(command, **numbers)
         except Refused:
-            if not is_done(command, self.status()):
-                raise
+            if command in IS_DONE:
+                with suppress(NoAnswer, Refused):
+                    if IS_DONE[command](self.status()):
+                        return
+            raise
 
     def status(self) -> dict[str, Any]:
         """Return the mode, the fault, the torque state, and the servo and sensor counters."""

@@ -176,7 +176,7 @@ def test_a_value_that_is_not_a_number_is_refused_by_parameter_name(fake, hand, g
     assert caught.value.reason == "request"
     with pytest.raises(Refused, match="grasp: force: expected a number, found"):
         asyncio.run(grasp_async(fake, given))
-    assert all(request == {"command": "status"} for request in fake.requests)
+    assert fake.requests == []
 
 
 LATE = {
@@ -385,10 +385,24 @@ def test_commands_that_are_already_fulfilled_succeed(fake, hand):
     hand.clear()
     fake.replies["status"] = {"ok": True, "mode": "fault", "torque": False}
     hand.disarm()
-    fake.replies["status"] = {"ok": True, "mode": "fault", "torque": True}
-    for refused in (hand.arm, hand.disarm, hand.clear):
-        with pytest.raises(Refused, match="not accepted in mode it is so"):
+    for status in ({"ok": True, "mode": "fault", "torque": True}, {"ok": False}, None):
+        fake.replies["status"] = status
+        for refused in (hand.arm, hand.disarm, hand.clear):
+            with pytest.raises(Refused, match="not accepted in mode it is so"):
+                refused()
+
+
+def test_a_refused_motion_command_causes_no_other_request(fake, hand):
+    fake.replies["rotate"] = MODE
+
+    async def rotate() -> None:
+        async with AsyncHand(fake.state_address, fake.command_address, timeout=60.0) as hand:
+            await hand.rotate(0.1)
+
+    for refused in (lambda: hand.rotate(0.1), lambda: asyncio.run(rotate())):
+        with pytest.raises(Refused):
             refused()
+    assert [request["command"] for request in fake.requests] == ["rotate", "rotate"]
 
 
 def test_unconfirmed_torque_off_causes_a_warning(fake, hand, caplog):
