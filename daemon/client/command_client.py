@@ -7,6 +7,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from numbers import Real
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -125,13 +126,15 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
             raise NoAnswer(
                 f"no {answer} within {timeout:g} s; is softfinger running, or still starting?{hint}"
             )
-        reply = msgpack.unpackb(socket.recv(), raw=False)
+        packed = socket.recv()
     finally:
         socket.close()
         context.term()
-    if not isinstance(reply, dict):
-        raise NoAnswer(f"{address} sent an invalid reply")
-    return reply
+    with suppress(ValueError, RecursionError, msgpack.UnpackException):
+        reply = msgpack.unpackb(packed)
+        if isinstance(reply, dict):
+            return reply
+    raise NoAnswer(f"{address} sent an invalid reply")
 
 
 def _number(what: str, value: Any) -> float:

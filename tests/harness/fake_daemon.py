@@ -84,8 +84,9 @@ class FakeDaemon:
 
     ``changes`` are merged into every state. ``requests`` contains the received commands, and
     ``keys`` contains each command's client key. ``replies`` maps a command to its reply, or to a
-    list of successive replies. ``silent`` suppresses all states, ``deaf`` suppresses all replies,
-    and ``dead`` names the fingers whose frames are suppressed.
+    list of successive replies; a reply of bytes is sent unchanged. ``silent`` suppresses
+    all states, ``deaf`` suppresses all replies, and ``dead`` names the fingers whose frames are
+    suppressed.
     """
 
     def __init__(self) -> None:
@@ -130,7 +131,7 @@ class FakeDaemon:
                 reply = self.replies.get(request["command"], {"ok": True})
                 if isinstance(reply, list):
                     reply = reply.pop(0)
-                self._server.send(msgpack.packb(reply))
+                self._server.send(reply if isinstance(reply, bytes) else msgpack.packb(reply))
             while self._extra:
                 self._publisher.send_multipart(self._extra.pop(0))
             if self.silent.is_set():

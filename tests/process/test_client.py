@@ -405,6 +405,13 @@ def test_a_refused_motion_command_causes_no_other_request(fake, hand):
     assert [request["command"] for request in fake.requests] == ["rotate", "rotate"]
 
 
+@pytest.mark.parametrize("reply", [b"", b"\xc1", b"hello", b"\x91" * 5000, msgpack.packb([1])])
+def test_an_unreadable_reply_is_reported_as_no_answer(fake, hand, reply):
+    fake.replies["arm"] = reply
+    with pytest.raises(NoAnswer, match=re.escape(f"{fake.command_address} sent an invalid reply")):
+        hand.arm()
+
+
 def test_unconfirmed_torque_off_causes_a_warning(fake, hand, caplog):
     hand.disarm()
     assert not caplog.messages
