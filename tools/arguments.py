@@ -129,7 +129,7 @@ def addresses(text: str) -> tuple[str, str]:
         both_addresses,
         default_addresses,
         is_host,
-        require_host,
+        require_address,
     )
 
     try:
@@ -139,7 +139,7 @@ def addresses(text: str) -> tuple[str, str]:
         elif "," in text or is_host(text):
             found = both_addresses(text, "address")
         for address in found:
-            require_host(address)
+            require_address(address)
         return found
     except SettingsError as error:
         raise argparse.ArgumentTypeError(str(error)) from None

@@ -23,7 +23,7 @@ from softfinger.daemon.client.connection import (
     both_addresses,
     default_addresses,
     is_host,
-    require_host,
+    require_address,
     still_waiting,
 )
 from softfinger.daemon.errors import HandClosed, Reason, Refused
@@ -202,7 +202,7 @@ class HandClient(Generic[_Done]):
             stream, commands = stream or usual[0], commands or usual[1]
         self.stream_address, self.command_address = stream, commands
         for address in (self.stream_address, self.command_address):
-            require_host(address)
+            require_address(address)
         self.client = client
         self.timeout = timeout
         self._keys = None if keys is None else load_client(keys)

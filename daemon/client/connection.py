@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 from collections.abc import Iterator
 from socket import getaddrinfo
@@ -20,6 +21,10 @@ SILENCE_TIME = 1.0  # time without a message before a warning is logged [s]
 _QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
 # Maximum message size [bytes]. A tactile frame with the largest grid is 131 kB.
 _MESSAGE_SIZE_MAX = 4_000_000
+
+# A source address and a semicolon may precede the host.
+_TCP = re.compile(r"tcp://(?:.*;)?(.*):([0-9]{1,5})")
+_IPC = re.compile(r"ipc://.{1,107}")  # The operating system limits the length of a socket's path.
 
 
 def default_addresses() -> tuple[str, str]:
@@ -60,15 +65,21 @@ def is_host(named: str) -> bool:
     return alone and ":" not in named[6:].split("]")[-1]
 
 
-def require_host(address: str) -> None:
-    """Raise SettingsError if this machine cannot resolve the host name of a TCP address.
+def require_address(address: str) -> None:
+    """Raise SettingsError if an address is malformed, or if this machine cannot resolve its host.
 
-    If the host is unknown, ZeroMQ reports no error and keeps trying to connect.
+    If the host is unknown or the port is too large, ZeroMQ reports no error and keeps trying to
+    connect.
     """
-    if not address.startswith("tcp://"):
+    tcp = _TCP.fullmatch(address)
+    if not (tcp and 0 < int(tcp[2]) < 65536) and not _IPC.fullmatch(address):
+        raise SettingsError(
+            f"{address}: malformed address; expected tcp://HOST:PORT with a port from 1 to 65535, "
+            "or ipc://PATH with at most 107 characters"
+        )
+    if tcp is None:
         return
-    # The host may be preceded by a source address and a semicolon.
-    host = address[6:].rpartition(";")[2].rpartition(":")[0].strip("[]")
+    host = tcp[1].strip("[]")
     try:
         getaddrinfo(host, None)
     except (OSError, UnicodeError) as error:

@@ -482,6 +482,21 @@ def test_an_unknown_host_fails_at_once_with_its_name(cls, given):
         cls(**given)
 
 
+@pytest.mark.parametrize("cls", [Hand, AsyncHand])
+@pytest.mark.parametrize(
+    "address",
+    ["foo", "http://127.0.0.1:9872", "ipc://", "ipc:///" + "a" * 107, "tcp://127.0.0.1"]
+    + [f"tcp://127.0.0.1:{port}" for port in ("", "abc", "0", "65536", "99999999", "9872/x")],
+)
+def test_a_malformed_address_fails_at_once(cls, inline, address):
+    for given in ((address, COMMAND_ADDRESS), (STREAM_ADDRESS, address)):
+        with pytest.raises(SettingsError, match=f"{re.escape(address)}: malformed address; expe"):
+            cls(*given)
+    if cls is Hand and address != "tcp://127.0.0.1":
+        done = inline("status", "--address", address)
+        assert (done.returncode, "malformed address" in done.stderr) == (2, True)
+
+
 def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeypatch):
     def unknown(host: str, _: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, f"no address for {host}")

@@ -587,7 +587,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
     [
         (("text.mcap",), "not an MCAP file"),
         (("text.mcap", "--port", "-1"), "expected a port"),
-        (("--address", "nowhere"), "nowhere: Invalid"),
+        (("--address", "nowhere"), "nowhere: malformed address"),
         (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "received no hand/state"),
         (("--address", "tcp://127.0.0.1:9", "--no-wait"), "no stream from tcp"),
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
