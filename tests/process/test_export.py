@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softfinger import read_recording
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.export import CsvTable, ParquetTable, export
 from softfinger.tools.recordings.reader import Recording
@@ -115,6 +116,13 @@ def test_files_have_plain_names_for_any_topic_prefix(tmp_path):
     names = {file.name for file in files}
     assert names == {"hidden.csv", "-[2Jhand-..-..-x.csv".replace("[", "-"), "nul-.csv", "-.csv"}
     assert {file.name for file in tmp_path.iterdir()} == names | {"a.mcap"}
+
+
+def test_frames_of_different_sizes_are_rejected(tmp_path):
+    frames = [(schema.TACTILE, frame(0.1 * k, 0, 44 - 12 * k)) for k in range(2)]
+    recording = write_recording(tmp_path / "a.mcap", frames)
+    with pytest.raises(RecordingError, match="32 × 32 cells after frames of 44 × 44 cells, expect"):
+        export(recording, tmp_path, CsvTable, [schema.TACTILE])
 
 
 def test_command_line_output(path, tmp_path, inline):

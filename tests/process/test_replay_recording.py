@@ -97,6 +97,8 @@ def test_missing_data_in_a_recording_is_reported(taken, tmp_path):
             message["seq_step"] = 4
     with pytest.raises(RecordingError, match="found only 1 of 4 frames"):
         recompute(write_recording(tmp_path / "thinned.mcap", thinned))
+    with pytest.raises(RecordingError, match="found tick 1 after tick"):
+        recompute(write_recording(tmp_path / "restarted.mcap", taken[:200] + taken[:200]))
     other = load(changes=["tactile.rows=32", "tactile.cols=32"])
     with pytest.raises(RecordingError, match="44 × 44 cells, expected 32 × 32 as in the settings"):
         recompute(write_recording(tmp_path / "other.mcap", taken), other)

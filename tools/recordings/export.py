@@ -167,6 +167,8 @@ def export(
     Raises
     ------
     OSError, MissingExtra
+    RecordingError
+        If the sizes of a sensor's frames differ, or if two topics need the same file name.
     """
     tables: dict[bytes, Table] = {}
     grids: dict[str, tuple[list[float], list[Any]]] = {}  # scan times and frames of each finger
@@ -187,6 +189,13 @@ def export(
             if topic == schema.TACTILE:
                 times, frames = grids.setdefault(message["finger"], ([], []))
                 shape = message["rows"], message["cols"]
+                if frames and shape != frames[0].shape:
+                    raise RecordingError(
+                        f"{recording.path}: found frames of {shape[0]} × {shape[1]} cells after "
+                        f"frames of {frames[0].shape[0]} × {frames[0].shape[1]} cells, expected "
+                        f"frames of equal size: export the data before and after t = {t:.3f} s "
+                        "separately with --to and --from"
+                    )
                 times.append(t)
                 frames.append(np.frombuffer(message["data"], "<u2").reshape(shape))
             tables[topic].add(row)

@@ -146,7 +146,7 @@ def recompute(
     """Run the control loop with the recorded inputs, and compare all states.
 
     ``settings`` replaces the recorded settings. Raises RecordingError if required topics or frames
-    are missing.
+    are missing, or if the recording contains several runs of the daemon.
     """
     own, calibrations = recorded_settings(recording)
     if not recording.count(schema.INPUT):
@@ -183,6 +183,12 @@ def _run(
     for tick, frames, commands, state in _ticks(recording, used, progress):
         if result.ticks == 0:
             result.from_start = tick["seq"] == 1
+        elif tick["seq"] <= last:
+            raise RecordingError(
+                f"{recording.path}: found tick {tick['seq']} after tick {last}, because the daemon "
+                "was restarted during the recording; expected a single run: record each run to "
+                "its own file"
+            )
         else:
             result.missing_ticks += tick["seq"] - last - 1
         last = tick["seq"]
