@@ -587,7 +587,7 @@ def test_two_threads_do_not_share_an_async_hand(fake):
 
 def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     left, right = fake_daemon.finger(0.0, 0), fake_daemon.finger(0.0, 1)
-    fake.changes = {"left": left, "right": right}
+    fake.changes = {"left": left, "right": right, "goal_force": math.nan}
     before = fake.published
     until(lambda: fake.published > before + 1)  # From now on, all states include the changes.
     told = inline("status", "--address", fake.state_address)
@@ -599,7 +599,7 @@ def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     assert float(line[3]) == pytest.approx(4.98, abs=0.06)
     assert float(line[4]) == pytest.approx(40.0, abs=0.06)
     whole = json.loads(inline("status", "--json", "--address", fake.state_address).stdout)
-    assert whole["left"]["force"] == left["force"]
+    assert (whole["left"]["force"], whole["goal_force"]) == (left["force"], None)
     fake.changes = {"mode": "fault", "fault": "servo 1: overload"}
     failed = inline("status", "--address", fake.state_address)
     assert (failed.returncode, failed.stdout) == (1, "fault: servo 1: overload\n")

@@ -59,11 +59,22 @@ def run(arguments: argparse.Namespace) -> int:
     except (NoAnswer, KeyFileError) as error:
         print(f"send: {error}", file=sys.stderr)
         return 2
-    print(json.dumps(reply, ensure_ascii=False))
+    print(json_text(reply))
     if reply.get("torque_off") == "unconfirmed":
         print(f"send: {UNCONFIRMED_TEXT}", file=sys.stderr)
         return 3
     return 0 if reply.get("ok") else 1
+
+
+def json_text(record: dict[str, Any]) -> str:
+    """Format a map as JSON; NaN and infinity, which JSON cannot represent, become null."""
+
+    def finite(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: finite(each) for name, each in value.items()}
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(finite(record), ensure_ascii=False)
 
 
 def si_numbers(words: list[str]) -> dict[str, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 
@@ -12,11 +11,19 @@ from softfinger.daemon.errors import NoStream
 from softfinger.daemon.wire.record_text import state_parts
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.arguments import add_daemon, no_stream, stream_address
+from softfinger.tools.terminal.send import json_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "Exit status: 0 the hand has no fault, 1 the hand has a fault, 2 no state arrived."
+    )
     add_daemon(parser, stream_address)
-    parser.add_argument("--json", action="store_true", help="print the whole state as JSON")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print the whole state as JSON, with null instead of NaN",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -27,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     except NoStream:
         print(f"status: {no_stream(arguments.address, arguments.keys)}", file=sys.stderr)
         return 2
-    print(json.dumps(asdict(state), ensure_ascii=False) if arguments.json else describe(state))
+    print(json_text(asdict(state)) if arguments.json else describe(state))
     return 1 if state.fault else 0
 
 
