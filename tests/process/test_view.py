@@ -307,7 +307,8 @@ def test_other_hosts_and_origins_are_refused_and_no_other_port_is_open(served):
     _, viewed = served
     port = viewed.host.rpartition(":")[2]
     assert got(viewed.host, "/")[0] == 200
-    assert got(viewed.host, "/", Host=f"localhost:{port}")[0] == 200
+    for host in (f"localhost:{port}", f"[::1]:{port}"):
+        assert got(viewed.host, "/", Host=host)[0] == 200
     hosts = ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", "")
     inexact = ("127.0.0.1", "localhost:1", f"{viewed.host}:evil", f"{viewed.host}@evil.example")
     for host in (*hosts, *inexact):
@@ -590,6 +591,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
         (("--address", "nowhere"), "nowhere: malformed address"),
         (("--address", "tcp://127.0.0.1:9", "--duration", "0.1"), "received no hand/state"),
         (("--address", "tcp://127.0.0.1:9", "--no-wait"), "no stream from tcp"),
+        (("--foxglove", "0", "--port", "0", "--duration", "0.1"), "use --foxglove PORT without"),
         (("--rate", "fast"), "expected 0.1 to 100 Hz"),
     ],
 )

@@ -130,7 +130,9 @@ class Site:
         """Serve requests on ``listener`` until `end` is called."""
         quiet = logging.getLogger("softfinger.view")
         quiet.disabled = True  # Do not log invalid requests from other programs.
-        self._hosts = {f"{name}:{listener.getsockname()[1]}" for name in (_LOOPBACK, "localhost")}
+        self._hosts = {
+            f"{name}:{listener.getsockname()[1]}" for name in (_LOOPBACK, "localhost", "[::1]")
+        }
         server = await serve(
             self._serve,
             sock=listener,

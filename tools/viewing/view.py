@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--port",
         type=_any_port,
         metavar="N",
-        help="port of the page (default: 9090, or a free port)",
+        help="port of the page without --foxglove (default: 9090, or a free port)",
     )
     parser.add_argument(
         "--timeout",
@@ -102,6 +102,13 @@ def run(arguments: argparse.Namespace) -> int:
         print(
             "view: --foxglove: found FILE.mcap, but only the live stream can be served; open "
             "the file directly in Foxglove",
+            file=sys.stderr,
+        )
+        return 2
+    if arguments.foxglove is not None and arguments.port is not None:
+        print(
+            "view: --port: found --foxglove, which serves the page and Foxglove on the same port; "
+            "use --foxglove PORT without --port",
             file=sys.stderr,
         )
         return 2
