@@ -11,6 +11,7 @@ import signal
 import socket
 import threading
 import time
+import webbrowser
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from email.message import Message
@@ -602,6 +603,16 @@ def test_invalid_input_is_reported_in_one_line(tmp_path, inline, monkeypatch, wo
     assert done.returncode in (1, 2)
     assert reason in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("display", ["", ":0"])
+def test_a_browser_is_opened_only_on_a_display(addresses, inline, monkeypatch, display):
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    done = inline("view", "--address", ",".join(addresses), "--port", "0", "--duration", "0.1")
+    assert ["to view the hand" in done.stdout, len(opened)] == [True, len(display) // 2]
 
 
 def test_pages_without_a_chosen_port_get_different_ports() -> None:

@@ -14,8 +14,10 @@ import errno
 import json
 import logging
 import math
+import os
 import secrets
 import socket
+import sys
 import threading
 import time
 import webbrowser
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
 
 _LOOPBACK = "127.0.0.1"
 _PORT = 9090  # default port
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # environment variables that name a display
 _WAITING_COUNT_MAX = 40  # maximum total number of commands awaiting a reply
 _REQUEST_TIMEOUT = 5.0  # timeout for a request's header [s], long enough for a busy browser
 _NAME_LENGTH_MAX = 40  # maximum displayed length of a command name [characters]
@@ -418,7 +421,9 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
                 site.announce()
             else:
                 print(f"view: http://{address}/ to view the hand", flush=True)
-            if foxglove is None and not away and not arguments.no_browser:
+            # On a Linux machine without a display, a text browser would block this thread.
+            display = sys.platform != "linux" or any(map(os.environ.get, _DISPLAYS))
+            if foxglove is None and not away and display and not arguments.no_browser:
                 # Omit the token, because other users may be able to see the browser's command line.
                 webbrowser.open(f"http://{address}/")
             ending.begin()

@@ -13,7 +13,7 @@ from softfinger.tools.stop_condition import StopCondition
 _EPILOG = """\
 Serves a web page for browsers on this machine. The printed address with the token opens a page with
 buttons and sliders, where the space key stops the hand. Without the token, the page only shows the
-hand.
+hand. If this machine has a display, the page is also opened in a browser.
 With --foxglove, the stream is also served to Foxglove, by default at ws://127.0.0.1:8765; the
 printed line names the layout file. Recordings can be opened directly in Foxglove.
 The server stops on Ctrl-C, or after --duration.
