@@ -131,7 +131,7 @@ class _Build:
     def run(self) -> None:
         """Build all parts. If interrupted, end all processes."""
         built: dict[str, Future[str]] = {}
-        jobs = max(1, min(processors(), len(self._missing), int(_available() / _MEMORY_MAX)))
+        jobs = max(1, int(min(processors(), len(self._missing), _available() / _MEMORY_MAX)))
         pool = ThreadPoolExecutor(jobs)
         try:
             for part in self._missing:
