@@ -8,6 +8,7 @@ from softfinger.daemon.control.envelope import Envelope, increased_force_limit
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.tools.cli import main
+from softfinger.tools.setup import envelope
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 
 
@@ -78,6 +79,33 @@ def test_a_map_is_computed_printed_drawn_and_read(tmp_path, capsys):
         Envelope(settings(envelope=own, law="upright"))
     with pytest.raises(SettingsError, match=r"control.envelope: .*none.toml: can't be read"):
         Envelope(settings(envelope=str(tmp_path / "none.toml")))
+
+
+@pytest.fixture
+def grasps(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Replace the simulation, and return the list of simulated cases."""
+    cases: list[Any] = []
+    monkeypatch.setattr(envelope, "build_kernels", lambda *_: None)
+    monkeypatch.setattr(
+        envelope, "grasped", lambda _, __, case: cases.append(case) or envelope.Cell("h", 0.0)
+    )
+    return cases
+
+
+SMALL = ["envelope", "--friction", "0.2", "--mass", "1", "1.0", "--processes", "1"]
+
+
+def test_repeated_values_are_simulated_once(grasps):
+    assert main([*SMALL, "--shape", "disc", "--shape", "disc", "--size", "30", "30"]) == 0
+    assert grasps == [("disc", 0.2, 1.0, 30.0)]
+
+
+@pytest.mark.parametrize("name", ["map.xyz", "map", "none/map.png"])
+def test_a_picture_that_cannot_be_written_is_rejected_first(grasps, tmp_path, inline, name):
+    done = inline(*SMALL, "--size", "30", "--plot", tmp_path / name)
+    assert done.returncode == 2
+    assert "expected a name ending in .png, .svg or .pdf in an existing folder" in done.stderr
+    assert grasps == []
 
 
 def test_hands_of_a_map_run_at_the_rate_of_the_profile():

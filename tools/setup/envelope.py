@@ -72,13 +72,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the map to a file that `grasp` can use; after an interruption by Ctrl-C, the "
         "same command resumes the run",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="plot the map (extra 'plot')")
+    parser.add_argument(
+        "--plot",
+        type=_picture,
+        metavar="FILE",
+        help="plot the map to a PNG, SVG or PDF file (extra 'plot')",
+    )
     add_sweep(parser)
 
 
 def _between(what: str, low: float, high: float) -> Callable[[str], float]:
     """Return a parser for nonzero numbers from ``low`` to ``high``."""
     return lambda text: number(text, what, low, high, includes_low=low > 0.0)
+
+
+def _picture(text: str) -> Path:
+    path = Path(text)
+    if path.suffix not in (".png", ".svg", ".pdf") or not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(
+            f"expected a name ending in .png, .svg or .pdf in an existing folder, found {text!r}"
+        )
+    return path
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -93,11 +107,11 @@ def run(arguments: argparse.Namespace) -> int:
     settings = profile(arguments)
     if arguments.plot:
         require("plot")
-    shapes = tuple(arguments.shape or SHAPES)
+    shapes = tuple(dict.fromkeys(arguments.shape or SHAPES))
     axes = (
-        tuple(sorted(arguments.friction or FRICTIONS)),
-        tuple(sorted(arguments.mass or MASSES)),  # The axes of the map must be sorted.
-        tuple(sorted(arguments.size or SIZES)),
+        tuple(sorted(set(arguments.friction or FRICTIONS))),
+        tuple(sorted(set(arguments.mass or MASSES))),  # The axes of the map must be sorted.
+        tuple(sorted(set(arguments.size or SIZES))),
     )
     print(
         f"{arguments.force:g} N; " + "; ".join(f"{k}: {text}" for k, text in OUTCOME_TEXTS.items())
