@@ -216,6 +216,12 @@ def add_range(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def range_text(arguments: argparse.Namespace) -> str:
+    """Return the words that name the selected time range in a message, or "" without a range."""
+    selected = math.isfinite(arguments.start) or math.isfinite(arguments.end)
+    return " between --from and --to" if selected else ""
+
+
 def add_daemon(
     parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
 ) -> None:

@@ -145,6 +145,7 @@ def test_command_line_output(path, tmp_path, inline):
 def test_invalid_exports_are_refused(tmp_path, inline):
     empty = tmp_path / "empty.mcap"
     write_recording(empty)
-    done = inline("export", empty)
-    assert done.returncode == 1
-    assert "the recording does not contain any messages" in done.stderr
+    for words, where in ((), ""), (("--from", "1000"), " between --from and --to"):
+        done = inline("export", empty, *words)
+        assert done.returncode == 1
+        assert f"{empty}: the recording does not contain messages{where}\n" in done.stderr

@@ -88,8 +88,10 @@ def test_time_page_shows_every_value_and_its_goal(run):
     assert np.nanmax(force.lines[2].get_ydata()) == 6.0
     assert np.nanmax(angle.lines[1].get_ydata()) == pytest.approx(math.degrees(0.1), abs=0.2)
     assert angle.get_xlim()[1] > 3.0
-    empty = replace(run, states={name: values[:0] for name, values in run.states.items()})
-    with pytest.raises(Missing, match="does not contain hand/state"):
+    empty = replace(
+        run, states={name: values[:0] for name, values in run.states.items()}, where=" x"
+    )
+    with pytest.raises(Missing, match=r"mcap: the recording does not contain hand/state x"):
         plot.PAGES["time"](empty)
 
 
@@ -130,18 +132,19 @@ def test_pages_are_written_as_svg_or_an_error_is_one_line(path, tmp_path, inline
     assert ElementTree.parse(files[0]).getroot().tag.endswith("svg")
     done = inline("plot", path, "--to", "0.2", "--out", tmp_path / "none")
     assert done.returncode == 1
-    assert "plot: the recording does not contain a contact" in done.stderr
+    where = "the recording does not contain a contact between --from and --to"
+    assert f"plot: {path}: {where}\n" in done.stderr
     write_recording(tmp_path / "nothing.mcap")
     done = inline("plot", tmp_path / "nothing.mcap", "--out", tmp_path / "none")
     assert done.returncode == 1
-    assert "plot: the recording does not contain hand/state" in done.stderr
+    assert "nothing.mcap: the recording does not contain hand/state\n" in done.stderr
 
 
 def test_without_settings_no_model_is_drawn(path, tmp_path):
     write_recording(tmp_path / "bare.mcap", Recording(path).messages([schema.STATE]))
     bare = loaded(tmp_path / "bare.mcap")
     for page in ("angle", "landscape"):
-        with pytest.raises(Missing, match=r"^the recording does not contain hand/settings"):
+        with pytest.raises(Missing, match=r"bare\.mcap: .* does not contain hand/settings"):
             plot.PAGES[page](bare)
 
 

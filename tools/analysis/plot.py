@@ -19,7 +19,7 @@ from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerEr
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.tools import style
-from softfinger.tools.arguments import add_range, to_stderr
+from softfinger.tools.arguments import add_range, range_text, to_stderr
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recorded_models
@@ -89,7 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     build_kernels(Settings(), print_event, FRAMES)
     with Progress("plot", recording.size) as progress:
-        data = RecordedRun(recording, recording.states(arguments.start, arguments.end, progress))
+        states = recording.states(arguments.start, arguments.end, progress)
+    data = RecordedRun(recording, states, range_text(arguments))
     folder.mkdir(parents=True, exist_ok=True)
     with style.settings():
         for name, draw in PAGES.items():
@@ -106,10 +107,19 @@ class Missing(SoftfingerError):
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """All or part of a recording; ``states`` contains the arrays of `Recording.states`."""
+    """All or part of a recording; ``states`` contains the arrays of `Recording.states`.
+
+    ``where`` names the selected part in error messages.
+    """
 
     recording: Recording
     states: dict[str, NDArray[Any]]
+    where: str = ""
+
+    def lacks(self, what: str) -> Missing:
+        """Return the error that the recording does not contain ``what``."""
+        path = self.recording.path
+        return Missing(f"{path}: the recording does not contain {what}{self.where}")
 
     @property
     def t(self) -> FloatArray:
@@ -132,19 +142,20 @@ class RecordedRun:
         try:
             return recorded_models(self.recording)
         except RecordingError as error:
-            raise Missing(str(error).removeprefix(f"{self.recording.path}: ")) from None
+            raise Missing(str(error)) from None
         except (SettingsError, TactileError, ValueError) as error:
             raise Missing(
-                f"can't build the contact model from the recorded settings: {error}"
+                f"{self.recording.path}: can't build the contact model from the recorded "
+                f"settings: {error}"
             ) from None
 
     def contacts(self) -> dict[str, ContactTable]:
         """Return the table of each finger with a contact; raise Missing if there is no contact."""
         if not self.t.size:
-            raise Missing("the recording does not contain hand/state")
+            raise self.lacks("hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
         if not touched:
-            raise Missing("the recording does not contain a contact")
+            raise self.lacks("a contact")
         return {name: self.models[FINGERS.index(name)].table for name in touched}
 
 
@@ -159,7 +170,7 @@ def draw_time(run: RecordedRun) -> Figure:
     The bands show one standard deviation, and the grey lines show the goals.
     """
     if not run.t.size:
-        raise Missing("the recording does not contain hand/state")
+        raise run.lacks("hand/state")
     figure = style.new_figure(7.2, 8.0)
     panels = figure.subplots(len(_AGAINST_TIME), 1, sharex=True)
     for panel, (label, factor, field, goal) in zip(panels, _AGAINST_TIME, strict=True):

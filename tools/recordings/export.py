@@ -17,7 +17,7 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import write_bytes, write_text
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.fields import KINDS
-from softfinger.tools.arguments import add_range, to_stderr
+from softfinger.tools.arguments import add_range, range_text, to_stderr
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import flat
 from softfinger.tools.recordings.reader import Recording
@@ -63,7 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     for each in files:
         print(each)
     if not files:
-        print(f"export: {path}: the recording does not contain any messages", file=sys.stderr)
+        where = range_text(arguments)
+        print(f"export: {path}: the recording does not contain messages{where}", file=sys.stderr)
     return 0 if files else 1
 
 
