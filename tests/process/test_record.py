@@ -1,6 +1,7 @@
 """Test that a recording contains all messages published until the recorder was interrupted."""
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -179,6 +180,22 @@ def test_a_truncated_recording_is_readable_up_to_the_cut_and_can_be_closed(tmp_p
     assert longest > 1000
     assert recover(path) == (len(read), "")  # An intact file is not changed.
     assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
+
+
+def test_a_recording_that_cannot_be_repaired_is_unchanged(tmp_path, monkeypatch):
+    def full_disk(_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "cut.mcap"
+    written(path)
+    path.write_bytes(cut := path.read_bytes()[:-100])
+    monkeypatch.setattr(RecordingWriter, "_wrote", full_disk)
+    why = (
+        r"cut\.mcap: .* can't be written: No space left on device; the original file is unchanged$"
+    )
+    with pytest.raises(RecordingError, match=why):
+        recover(path)
+    assert (path.read_bytes(), [*tmp_path.iterdir()]) == (cut, [path])
 
 
 def test_a_recording_with_flipped_bits_raises_only_its_documented_error(tmp_path):

@@ -415,14 +415,19 @@ def recover(path: Path) -> tuple[int, str]:
         )
     closed = path.with_name(path.name + ".recovered")
     closed.unlink(missing_ok=True)
-    writer = RecordingWriter(closed)
     try:
+        writer = RecordingWriter(closed)
         for topic, message in recording.messages():
             writer.add(topic, message)
         writer.close()
         closed.replace(path)
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from None
+    except (OSError, RecordingError) as error:
+        # The writer's message describes the copy, which is removed.
+        cause = error.__context__ or error
+        raise RecordingError(
+            f"{path}: the repaired copy {closed.name} can't be written: "
+            f"{getattr(cause, 'strerror', cause)}; the original file is unchanged"
+        ) from None
     finally:
         with contextlib.suppress(OSError):
             closed.unlink(missing_ok=True)
