@@ -179,6 +179,20 @@ def test_a_time_range_is_replayed_at_the_original_rate(played, addresses, inline
     assert done.stdout.startswith(("20 of", "21 of"))
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--recompute", "--from", "0"), "remove --from, --to and --speed"),
+        (("--recompute", "--to", "2"), "remove --from, --to and --speed"),
+        (("--recompute", "--speed", "3"), "remove --from, --to and --speed"),
+        (("--config", "sim", "--no-wait", "--to", "0.01"), "--config requires --recompute"),
+    ],
+)
+def test_options_without_effect_are_rejected(played, addresses, inline, words, reason):
+    done = inline("replay", played[0], "--address", addresses[0], *words)
+    assert (done.returncode, reason in done.stderr) == (2, True)
+
+
 def test_the_golden_recording_gives_the_same_states() -> None:
     result = recompute(Recording(RECORDING))
     assert result.from_start

@@ -14,7 +14,7 @@ from softfinger.daemon.profile.settings import StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, REPEATED_COUNTS, pack
-from softfinger.tools.arguments import add_range, number, to_stderr
+from softfinger.tools.arguments import add_range, number, range_text, to_stderr
 from softfinger.tools.stop_condition import StopCondition
 
 if TYPE_CHECKING:
@@ -73,12 +73,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Publish the recording, or recompute its states and compare them with the recorded states.
 
+    Returns 2 if the options contradict each other.
+
     Raises
     ------
     RecordingError, SettingsError, TactileError, OSError
     """
     from softfinger.tools.recordings.reader import Recording
 
+    problem = ""
+    if arguments.recompute and (range_text(arguments) or arguments.speed != 1.0):
+        problem = "--recompute processes the whole recording; remove --from, --to and --speed"
+    elif arguments.config is not None and not arguments.recompute:
+        problem = "--config requires --recompute"
+    if problem:
+        to_stderr("replay")(problem)
+        return 2
     recording = Recording(arguments.file, to_stderr("replay"))
     if arguments.recompute:
         return _recompute(arguments, recording)
