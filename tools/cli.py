@@ -9,6 +9,7 @@ raises another SoftfingerError or an OSError (exit status 1).
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import io
 import os
@@ -21,6 +22,7 @@ from typing import Any, NoReturn
 from softfinger import __version__
 from softfinger.daemon.errors import SettingsError, SoftfingerError, nearest
 
+_FULL = (errno.ENOSPC, errno.EFBIG)  # The disk is full, or the file has its maximum size.
 _OPTIONS = ("-h", "--help", "--version")
 _UNKNOWN = re.compile(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)")
 
@@ -222,7 +224,7 @@ def _main(argv: Sequence[str] | None) -> int:
         return 130  # exit status for Ctrl-C by shell convention
     except BrokenPipeError:
         # The reader has closed the pipe, as with `| head`. Discard the remaining output.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         return 0
     except SettingsError as error:  # The error message has one line per key.
         print(error, file=sys.stderr)
@@ -231,8 +233,18 @@ def _main(argv: Sequence[str] | None) -> int:
         print(f"{called}: {error}", file=sys.stderr)
         return 1
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno not in _FULL:
             raise
-        print(f"{called}: {error.filename}: {error.strerror}", file=sys.stderr)
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"{called}: {where}{error.strerror}", file=sys.stderr)
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _discard_output()
         return 1
     return status
+
+
+def _discard_output() -> None:
+    """Redirect standard output to /dev/null, so that Python's flush at exit can't fail."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -5,6 +5,7 @@ import os
 import select
 import signal
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -198,6 +199,13 @@ def test_characters_that_a_pipe_cannot_encode_are_replaced(words):
     )
     assert (ascii_alone.returncode, ascii_alone.stderr) == (0, "")
     assert ascii_alone.stdout == plain.stdout.encode("ascii", "replace").decode()
+
+
+def test_output_to_a_full_disk_is_reported_in_one_line():
+    with Path("/dev/full").open("w") as full:
+        process = started("config", "list", stdout=full)
+    assert process.communicate(timeout=300)[1] == "config: No space left on device\n"
+    assert process.returncode == 1
 
 
 def test_a_disabled_compiler_is_reported_in_one_line():
