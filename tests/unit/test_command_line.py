@@ -79,6 +79,19 @@ def test_numbers_may_have_units(words, numbers):
     assert si_numbers(words) == pytest.approx(numbers)
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--baud", "0"), "expected a baud rate of 1 or more, found '0'"),
+        (("--baud", "-9600"), "expected a baud rate of 1 or more, found '-9600'"),
+        (("--wait", "nan"), "expected a time above 0 s, found 'nan'"),
+    ],
+)
+def test_scan_rejects_numbers_that_no_port_supports(inline, words, reason):
+    done = inline("scan", "/dev/does-not-exist", *words)
+    assert (done.returncode, reason in done.stderr) == (2, True)
+
+
 def test_profiles_and_keys_are_shown_from_any_folder(inline, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hil").mkdir()  # A user's project may contain a folder with the same name.

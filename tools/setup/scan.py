@@ -10,6 +10,7 @@ from softfinger.daemon.diagnosis.ports import serial_ports
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.servos.control_table import BAUD_RATES
 from softfinger.daemon.servos.provisioning import ONE_SERVO_ONLY, SEARCH_TIME, FoundServo, search
+from softfinger.tools.arguments import number, seconds
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--baud",
-        type=int,
+        type=lambda text: int(number(text, "a baud rate of 1 or more", 1.0, includes_low=True)),
         action="append",
         metavar="N",
         help="baud rate to try; can be given several times (default: all baud rates that servos "
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--wait",
-        type=float,
+        type=seconds,
         default=SEARCH_TIME,
         metavar="S",
         help="listening time per baud rate in seconds (0.8 s is enough for 253 servos at 1 Mbaud)",
