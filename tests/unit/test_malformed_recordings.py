@@ -81,6 +81,14 @@ def test_a_malformed_frame_is_reported_and_omitted(tmp_path, spoil):
     assert Recording(path).states()["t"].size == 10
 
 
+@pytest.mark.parametrize("delay", [None, "0.02"])
+def test_a_message_without_a_valid_time_is_not_the_origin_of_the_times(tmp_path, delay):
+    state = sample(schema.STATE) | {"timestamp": 1e9 + 1.0, "mono_ns": 6_000_000_000}
+    late = frame(0) | {"delay_s": delay}
+    found = write_recording(tmp_path / "a.mcap", [(schema.TACTILE, late), (schema.STATE, state)])
+    assert found.states()["t"].tolist() == pytest.approx([1.0])
+
+
 @pytest.mark.parametrize("name", ["settings", "calibration_left"])
 def test_settings_without_text_are_reported(tmp_path, name):
     message = settings_message()

@@ -163,7 +163,10 @@ class Recording:
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):
                 # A frame's mono_ns is the scan time, but its timestamp is the arrival time.
-                after = stamp - self.start - float(message.get("delay_s", 0.0))
+                delay = message.get("delay_s", 0.0)
+                if not isinstance(delay, int | float) or not math.isfinite(stamp - delay):
+                    continue
+                after = stamp - self.start - delay
                 self._left, self.chunks = state
                 # The timestamp is a float with a resolution of 0.2 µs, so round to 1 µs.
                 return mono - round(after * 1e6) * 1000
