@@ -11,7 +11,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from softfinger.daemon.errors import RecordingError
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
+from softfinger.tools.analysis.analyse import analyse, open_source
+from softfinger.tools.recordings.channels import topic_of
 from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
@@ -33,9 +36,18 @@ def golden() -> Iterator[Any]:
 
 
 def rewritten(
-    path: Path, profile: str = "", others: bool = False, ids: int = 1, prefix: str = "", **options
+    path: Path,
+    profile: str = "",
+    others: bool = False,
+    ids: int = 1,
+    prefix: str = "",
+    merged: bool = False,
+    **options: Any,
 ) -> Path:
-    """Rewrite the golden recording with ``ids`` channels per topic; ``others`` adds more topics."""
+    """Rewrite the golden recording with ``ids`` channels per topic; ``others`` adds more topics.
+
+    ``merged`` writes the frames of both fingers to the same channel.
+    """
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start(profile, "merged")
@@ -58,7 +70,7 @@ def rewritten(
                 schemas[kind.name] = writer.register_schema(kind.name, kind.encoding, kind.data)
             key = channel.topic, k % ids
             if key not in channels:
-                name = prefix + channel.topic
+                name = prefix + (topic_of(channel.topic).decode() if merged else channel.topic)
                 channels[key] = writer.register_channel(name, "json", schemas[kind.name])
             writer.add_message(channels[key], times[0], message.data, times[1])
         writer.finish()
@@ -71,6 +83,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "other channels": {"others": True},
     "several channels of a topic": {"ids": 3},
     "names with a slash": {"prefix": "/"},
+    "one channel of frames": {"merged": True},
     "no chunks": {"use_chunking": False, "others": True},
     "no index": {"index_types": IndexType.NONE},
     "no statistics": {"use_statistics": False},
@@ -108,6 +121,13 @@ def test_all_variants_of_the_format_give_the_same_recording(tmp_path, options):
     if told:
         assert f"skipped {2 * others} messages on 2 channels from other programs" in told[0]
     assert [each.name for each in export(recording, tmp_path, CsvTable, [schema.STATE])]
+
+
+def test_frames_of_one_channel_are_analysed_for_each_finger(tmp_path):
+    path = rewritten(tmp_path / "a.mcap", merged=True)
+    contacts = analyse(open_source(path, Settings(), own=True), lambda _: None)
+    assert [each.finger for each in contacts] == ["left", "right"]
+    assert sum(each.t.size for each in contacts) == Recording(path).count(schema.TACTILE) > 0
 
 
 def test_a_truncated_file_with_other_channels_is_read_up_to_the_cut_and_not_rewritten(tmp_path):

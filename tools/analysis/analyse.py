@@ -170,7 +170,6 @@ class Source:
 
     settings: Settings
     models: Callable[[], tuple[FingerModel, FingerModel]]
-    fingers: tuple[int, ...]
     total: int
     frames: Callable[[OnProgress], Iterator[tuple[int, float, Counts]]]
     recording: FrameRecording | None = None
@@ -209,18 +208,13 @@ def _stream(path: Path, settings: Settings, own: bool) -> Source:
     models = partial(recorded_models, recording) if own else partial(_models_of, settings)
     if own:
         settings, _ = recorded_settings(recording)
-    present = tuple(
-        finger
-        for finger, name in enumerate(FINGERS)
-        if f"{schema.TACTILE.decode()}/{name}" in recording.counts
-    )
 
     def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:
         for _, message in recording.messages([schema.TACTILE], progress=progress):
             counts = counts_of(recording, message, settings)
             yield FINGERS.index(message["finger"]), recording.time(message), counts
 
-    return Source(settings, models, present, recording.size, frames)
+    return Source(settings, models, recording.size, frames)
 
 
 def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
@@ -255,7 +249,7 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             yield 0, t, recording.counts[k]
 
     models = partial(_models_of, settings)
-    return Source(settings, models, (0,), count, frames, recording)
+    return Source(settings, models, count, frames, recording)
 
 
 def _models_of(settings: Settings) -> tuple[FingerModel, FingerModel]:
@@ -332,10 +326,12 @@ class _Pass:
 def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
     """Compute each sensor's contacts. Errors in ``source.frames`` are propagated."""
     models = source.models()
-    passes = {finger: _Pass(source, models, finger) for finger in source.fingers}
+    passes: dict[int, _Pass] = {}
     for finger, t, counts in source.frames(progress):
+        if finger not in passes:
+            passes[finger] = _Pass(source, models, finger)
         passes[finger].add(t, counts)
-    return [each.contacts(finger, source.truths) for finger, each in passes.items()]
+    return [each.contacts(finger, source.truths) for finger, each in sorted(passes.items())]
 
 
 def write_csv(path: Path, contacts: list[Contacts]) -> None:
