@@ -118,6 +118,16 @@ def test_files_have_plain_names_for_any_topic_prefix(tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == names | {"a.mcap"}
 
 
+@pytest.mark.parametrize("name", ["tick_s", "seq"])
+def test_a_value_of_another_type_is_written_to_csv_only(tmp_path, name):
+    messages = [(schema.STATE, sample(schema.STATE) | {name: value}) for value in (1, "abc")]
+    recording = write_recording(tmp_path / "a.mcap", messages)
+    with pytest.raises(RecordingError, match=r"hand-state\.parquet: .*abc.*; use --format csv"):
+        export(recording, tmp_path, ParquetTable, [schema.STATE])
+    export(recording, tmp_path, CsvTable, [schema.STATE])
+    assert [row[name] for row in rows_of(tmp_path / "hand-state.csv")] == ["1", "abc"]
+
+
 def test_frames_of_different_sizes_are_rejected(tmp_path):
     frames = [(schema.TACTILE, frame(0.1 * k, 0, 44 - 12 * k)) for k in range(2)]
     recording = write_recording(tmp_path / "a.mcap", frames)

@@ -104,7 +104,10 @@ class CsvTable:
 
 
 class ParquetTable:
-    """Parquet file whose columns have the schema's types."""
+    """Parquet file whose columns have the schema's types.
+
+    Raises RecordingError if a value has another type.
+    """
 
     suffix = ".parquet"
 
@@ -133,13 +136,22 @@ class ParquetTable:
             self._flush()
 
     def _flush(self) -> None:
-        self._writer.write_table(self._arrow.Table.from_pylist(self._rows, self._schema))
-        self._rows.clear()
+        rows, self._rows = self._rows, []
+        try:
+            table = self._arrow.Table.from_pylist(rows, self._schema)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise RecordingError(
+                f"{self._file.name}: found a value of another type than the column's "
+                f"({str(error)[:200]}); use --format csv, which accepts all types"
+            ) from None
+        self._writer.write_table(table)
 
     def close(self) -> None:
-        self._flush()
-        self._writer.close()
-        self._file.close()
+        try:
+            self._flush()
+        finally:
+            self._writer.close()
+            self._file.close()
 
 
 Table = CsvTable | ParquetTable
@@ -169,7 +181,8 @@ def export(
     ------
     OSError, MissingExtra
     RecordingError
-        If the sizes of a sensor's frames differ, or if two topics need the same file name.
+        If the sizes of a sensor's frames differ, if two topics need the same file name, or if a
+        value does not have the type of its Parquet column.
     """
     tables: dict[bytes, Table] = {}
     grids: dict[str, tuple[list[float], list[Any]]] = {}  # scan times and frames of each finger
