@@ -4,6 +4,7 @@ import copy
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -14,6 +15,7 @@ from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
+from softfinger.tools.recordings import replay
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute
 from tests.conftest import until
@@ -177,6 +179,45 @@ def test_a_time_range_is_replayed_at_the_original_rate(played, addresses, inline
     words = ("--address", addresses[0], "--no-wait", "--from", "0.2", "--to", "0.4")
     done = inline("replay", played[0], *words)
     assert done.stdout.startswith(("20 of", "21 of"))
+
+
+class SilentWire:
+    """Replace `Wire`: publish nothing, and count the time that the replay would wait."""
+
+    def __init__(self, *_: object) -> None:
+        SilentWire.waited = 0.0
+
+    def subscribed(self, seconds: float) -> None:
+        SilentWire.waited += seconds
+
+    def send(self, *_: object) -> None:
+        pass
+
+    def __enter__(self) -> "SilentWire":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize("step", [{"timestamp": 12.0}, {"mono_ns": -(10**10)}])
+def test_the_pace_does_not_depend_on_changes_of_a_clock(tmp_path, inline, monkeypatch, step):
+    messages = []
+    for k in range(100):
+        message = sample(schema.STATE) | {
+            "timestamp": 1e9 + 0.01 * k,
+            "mono_ns": 10**11 + k * 10**7,
+        }
+        if k >= 50:
+            message |= {name: message[name] + size for name, size in step.items()}
+        messages.append((schema.STATE, message))
+    write_recording(tmp_path / "a.mcap", messages)
+    monkeypatch.setattr(replay, "Wire", SilentWire)
+    clock = SimpleNamespace(monotonic=lambda: SilentWire.waited)
+    monkeypatch.setattr(replay, "time", clock)
+    done = inline("replay", tmp_path / "a.mcap", "--no-wait")
+    assert done.stdout == "100 of 100 messages published\n"
+    assert SilentWire.waited == pytest.approx(0.99, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,9 @@ results.
 Exit status: 0 published, or all states identical; 1 the file can't be read; 3 states differ."""
 
 _SUBSCRIBER_WAIT = 10.0  # maximum waiting time for the first subscriber [s]
+# Decrease of the recorded time from which a new clock is assumed [s]. A frame has the time of its
+# scan and is therefore slightly older than the message before it.
+_CLOCK_STEP_MIN = 1.0
 _EXIT_DIFFERENT = 3
 
 
@@ -108,15 +112,18 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
                 not ending.is_requested and time.monotonic() < waited and not wire.subscribed(0.1)
             ):
                 pass
-        began, first = time.monotonic(), None
+        began, first, newest = time.monotonic(), 0.0, math.inf
         for topic, message in recording.messages(start=arguments.start, end=arguments.end):
             if message.get("again") is not True:  # Repeated messages are older than the recording.
-                stamp = message.get("timestamp", 0.0)
-                if not isinstance(stamp, int | float):
+                # The system's Unix time may have been changed during the recording.
+                t = recording.time(message)
+                if not math.isfinite(t):
                     continue  # Ignore invalid messages.
-                if first is None:
-                    began, first = time.monotonic(), stamp
-                due = began + (stamp - first) / arguments.speed
+                # The daemon's clock restarts with the machine.
+                if t < newest - _CLOCK_STEP_MIN:
+                    began, first = time.monotonic(), t
+                newest = t
+                due = began + (t - first) / arguments.speed
                 while not ending.is_requested and (left := due - time.monotonic()) > 0.0:
                     wire.subscribed(min(left, 0.1))
             if ending.is_requested:
