@@ -150,13 +150,13 @@ def test_non_finite_numbers_are_read_as_nan(tmp_path):
 def test_reading_a_time_range_and_selected_topics(tmp_path):
     sent = written(tmp_path / "a.mcap", 2000)  # The recording contains several chunks.
     recording = Recording(tmp_path / "a.mcap")
-    assert recording.chunks > 3
     part = [each for each in sent if 499.5 <= each[1]["timestamp"] - 1e9 <= 600.5]
     assert list(recording.messages(start=499.5, end=600.5)) == part
     seen: list[int] = []
     frames = list(recording.messages([schema.TACTILE], progress=seen.append))
     assert frames == [each for each in sent if each[0] == schema.TACTILE]
     assert seen == sorted(seen)
+    assert len(seen) > 3
 
 
 def test_a_truncated_recording_is_readable_up_to_the_cut_and_can_be_closed(tmp_path):

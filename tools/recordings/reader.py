@@ -100,7 +100,6 @@ class Recording:
         self.others: dict[str, int] = {}  # number of messages in each channel of other programs
         self.start = math.nan
         self.end = math.nan
-        self.chunks = 0
         self._first = 0  # log time of the earliest message [ns]
         self._left = 0  # remaining number of bytes that may be unpacked
         self._names: dict[int, str] = {}  # maps channel numbers to channel names
@@ -158,7 +157,7 @@ class Recording:
     @cached_property
     def zero(self) -> int:
         """Time of the first message on the daemon's clock [ns], which is the origin of ``t``."""
-        state = self._left, self.chunks  # `messages` changes both variables.
+        left = self._left  # `messages` changes this variable.
         for _, message in self.messages():
             mono, stamp = message.get("mono_ns"), message.get("timestamp")
             if isinstance(mono, int) and isinstance(stamp, float) and not message.get("again"):
@@ -167,7 +166,7 @@ class Recording:
                 if not isinstance(delay, int | float) or not math.isfinite(stamp - delay):
                     continue
                 after = stamp - self.start - delay
-                self._left, self.chunks = state
+                self._left = left
                 # The timestamp is a float with a resolution of 0.2 µs, so round to 1 µs.
                 return mono - round(after * 1e6) * 1000
         return 0
@@ -238,7 +237,6 @@ class Recording:
 
         Chunks outside ``times`` are skipped.
         """
-        self.chunks = 0
         with open_regular(self.path) as file:
             file.seek(len(_MAGIC))
             self._left = unpacked_size_max(file)
@@ -247,7 +245,6 @@ class Recording:
                     if kind == _DATA_END:
                         return
                     if kind == _CHUNK:
-                        self.chunks += 1
                         yield from self._messages_in(content, times)
                     elif (message := self._take_record(kind, content)) is not None:
                         yield message
@@ -375,7 +372,6 @@ class Recording:
         for number, name in self._names.items():
             count = statistics.channel_message_counts.get(number, 0)
             self.counts[name] = self.counts.get(name, 0) + count
-        self.chunks = statistics.chunk_count
         if statistics.message_count:
             self._first = statistics.message_start_time
             self.start = self._first * 1e-9
