@@ -47,6 +47,18 @@ def test_a_push_beyond_the_margin_is_held_with_more_force(sections, seed):
     assert moved[0.0] > 10e-3
 
 
+@pytest.mark.parametrize("seed", [1, 2, pytest.param(3, marks=pytest.mark.extended)])
+def test_a_load_that_grows_within_a_second_is_answered_before_the_object_slides(seed):
+    """Without the extrapolation, the object slides by more than 20 mm or is lost."""
+    with Hand({"simulation": {"seed": seed, "object_mass": 0.1}}) as hand:
+        grasped(hand)
+        before = hand.plant.object_pose.copy()
+        push_along(hand, 1.1 * BORNE, rate=12.0)
+        hand.watch(0.5)
+        assert hand.mode == "holding"
+        assert math.dist(hand.plant.object_pose[:2], before[:2]) < 2e-3
+
+
 def test_the_grip_force_decreases_after_the_load_is_removed():
     with Hand(PAPER) as hand:
         grasped(hand)
