@@ -145,6 +145,25 @@ def calibrated_grid(settings: Settings, finger: int, calibration: Calibration | 
     return make_grid(settings, finger, calibration.centre.centre, calibration.centre.rotation)
 
 
+def working_cells(
+    settings: Settings,
+    finger: int,
+    active: NDArray[np.bool_] | None = None,
+    calibration: Calibration | None = None,
+) -> NDArray[np.bool_]:
+    """Return a mask [rows, cols] of the cells that are ``active`` and not dead.
+
+    Dead cells are listed in the settings, or have a gain of 0 in the calibration.
+    """
+    tactile = settings.tactile
+    alive = np.ones((tactile.rows, tactile.cols), np.bool_) if active is None else active.copy()
+    for row, col in tactile.dead[finger]:
+        alive[row, col] = False
+    if calibration is not None and calibration.equilibrate is not None:
+        alive &= np.array(calibration.equilibrate.gain) > 0.0
+    return alive
+
+
 def make_estimator(
     settings: Settings,
     material: Material,
@@ -161,20 +180,17 @@ def make_estimator(
     settings, material, finger
         Settings for the hand, material of the tip, and index of the finger.
     active
-        True for cells that exist [rows, cols]. The dead cells listed in the settings are also
-        excluded.
+        True for cells that exist [rows, cols]. Dead cells are also excluded; see `working_cells`.
     calibration
         With a calibration, frames are pressures [Pa] from a `Converter`; otherwise, frames are
         counts.
     """
     tactile = settings.tactile
-    alive = np.ones((tactile.rows, tactile.cols), np.bool_) if active is None else active.copy()
-    for row, col in tactile.dead[finger]:
-        alive[row, col] = False
+    alive = working_cells(settings, finger, active, calibration)
     saturation, threshold, quantum = float(tactile.full_count), float(tactile.threshold), 0.0
     if calibration is not None:
         converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
-        alive &= converter.live
+        converter.live = alive
         saturation, quantum = converter.saturation, converter.quantum
         # The estimator itself subtracts half a frame unit from the threshold.
         threshold = quantum * max(threshold - 0.5, 0.0) + 0.5 if threshold else 0.0

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.perception.calibration_file import Converter, least_end
-from softfinger.daemon.perception.finger_model import FingerModel, make_estimator
+from softfinger.daemon.perception.finger_model import FingerModel, make_estimator, working_cells
 from softfinger.daemon.perception.hand_estimator import HandEstimator
 from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings
@@ -145,6 +145,7 @@ class FingerPerception:
         )
         self.estimate = ContactEstimate()  # estimate from the last valid frame
         active = getattr(sensor, "live", None)  # Some recordings contain only some of the cells.
+        self._live = working_cells(settings, model.finger, active, calibration)
         self._estimator = make_estimator(
             settings, model.material, model.finger, active, calibration
         )
@@ -154,6 +155,7 @@ class FingerPerception:
         self._converter: Converter | None = None
         if calibration is not None:
             self._converter = Converter(calibration, tactile.pascal_per_count, tactile.full_count)
+            self._converter.live = self._live
             self._scale = 1.0
             self._quantum = self._converter.quantum
         self._readings: NDArray[Any] | None = None  # newest frame [Pa or counts]
@@ -161,7 +163,6 @@ class FingerPerception:
         self.info = self._info(settings, model)
         self._events = events
         self._zero: NDArray[np.uint16] | None = None  # zero offset if there is no converter
-        self._live = np.ones(model.grid.shape, np.bool_) if active is None else active
         self._unloaded = UnloadedCells(model.grid, settings.tip.radius, self._live)
         self._noise = tactile.noise  # cell noise from the settings [Pa]
         self._tare_sum: NDArray[np.uint32] | int = 0
@@ -181,7 +182,6 @@ class FingerPerception:
         """Start a tare, which sets each cell's zero offset to the mean of the next readings."""
         self._tare_sum = 0
         self._tare_remaining_count = _TARE_FRAME_COUNT
-        self._unloaded.reset_zero()
 
     def update(self) -> Frame | None:
         """Process and return a new frame, or return None if no new frame has arrived."""
@@ -199,7 +199,8 @@ class FingerPerception:
             self._measure_zero(counts)
         if frame.valid:
             if self.frame_count % _ZERO_INTERVAL == 1:
-                self._unloaded.update(counts)
+                zero = self._zero if self._converter is None else self._converter.zero
+                self._unloaded.update(counts, zero)
                 self._estimator.noise = max(self._noise, self._unloaded.noise * self._quantum)
             counts = self._unloaded.corrected(counts, int(self.full_count))
         if self._converter is not None:
@@ -247,13 +248,14 @@ class FingerPerception:
         if self._tare_remaining_count:
             return
         mean, side = self._tare_sum / _TARE_FRAME_COUNT, FINGERS[self.finger]
-        ends = self.full_count - np.round(mean)
+        ends = self.full_count - np.round(mean)[self._live]
         if not np.median(ends) > 0.0:  # Most cells are saturated at their zero offset.
             text = f"the {side} sensor was not tared: most cells are saturated without contact"
             self._events.append(("warning", "tare", text))
             return
+        self._unloaded.reset_zero()
         if self._converter is not None:
-            moved = (mean - self._converter.zero)[self._live & self._converter.live]
+            moved = (mean - self._converter.zero)[self._live]
             self._converter.zero[:] = mean
             self._estimator.saturation = self._converter.saturation
         else:

@@ -10,6 +10,7 @@ reading. Readings are clipped at 0, so unloaded cells cannot show a negative zer
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,16 +64,21 @@ class UnloadedCells:
         )
 
     def reset_zero(self) -> None:
-        """Reset the zero shift; the next frame sets a new reference."""
+        """Reset the zero shift and the noise; the next frame sets a new reference."""
         self.zero_shift = 0
-        self._reference = None
+        self._reference = self._variance = None
 
-    def update(self, counts: NDArray[np.uint16]) -> None:
-        """Update the estimates with a frame of raw ``counts``."""
+    def update(self, counts: NDArray[np.uint16], zero: NDArray[Any] | None = None) -> None:
+        """Update the estimates with a frame of raw ``counts``; ``zero`` contains the zero offsets.
+
+        The offsets of the cells differ, so without ``zero`` their spread would count as noise.
+        """
         if not self._cells.size:
             self._update_changes(counts.ravel()[self._live].astype(np.float64))
             return
         read = counts.ravel()[self._cells].astype(np.float64)
+        if zero is not None:
+            read -= zero.ravel()[self._cells]
         level = float(np.median(read))
         if self._reference is None:
             self._reference = level

@@ -1,11 +1,17 @@
 """Test hands that differ from their settings; the plant's true values are the reference."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from softfinger.daemon.perception.finger_model import make_models
+from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.perception.unloaded_cells import UnloadedCells
+from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
+from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.types import Frame
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.rigs import merged
 from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, drawn_in_mujoco, grip
@@ -147,6 +153,34 @@ def test_a_rising_zero_offset_is_subtracted_and_saturated_cells_stay_saturated()
     assert corrected[16, 14] == 203
     cells.reset_zero()
     assert cells.corrected(counts, 255) is counts
+
+
+@pytest.mark.parametrize(
+    ("spread", "dead"),
+    [(1500.0, {}), (0.0, {(0, c): 60_000 for c in range(44)}), (0.0, {(20, 20): 50_000})],
+    ids=["offsets that differ", "a dead row", "a dead cell under the tip"],
+)
+def test_tared_offsets_and_listed_dead_cells_do_not_count_as_noise(spread, dead):
+    tactile = {"full_count": 65_535, "dead": (tuple(dead), ())}
+    settings = Settings.model_validate({"loop": {"clock": "virtual"}, "tactile": tactile})
+    sensor = SimpleNamespace(latest=lambda: None)
+    finger = FingerPerception(sensor, make_models(settings)[0], settings, [])
+    rng, grid = np.random.default_rng(1), make_grid(settings, 0)
+    rest = 9000.0 + rng.normal(0.0, spread, grid.shape)
+    scale, noise = settings.tactile.pascal_per_count, settings.tactile.noise
+    pressed = grid.pressure(make_tip(settings), make_material(settings.material), 2e-3) / scale
+    for k in range(120):
+        counts = rest + rng.normal(0.0, noise / scale, grid.shape) + pressed * (k >= 100)
+        for cell, value in dead.items():
+            counts[cell] = value
+        frame = Frame(k, 0.01 * k, 0.01 * k, True, np.rint(counts).astype(np.uint16))
+        sensor.latest = lambda frame=frame: frame
+        if k == 5:
+            finger.tare()
+        finger.update()
+    assert finger.noise == pytest.approx(noise, rel=0.2)
+    assert finger._estimator.saturation > 50_000
+    assert finger.estimate.d == pytest.approx(2e-3, rel=0.05)
 
 
 def test_a_second_contact_near_the_tip_is_not_a_zero_offset():
