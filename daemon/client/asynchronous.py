@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -26,6 +27,15 @@ from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandStat
 __all__ = ["AsyncHand", "AsyncSubscription"]
 
 _Record = TypeVar("_Record")
+
+
+async def _in_own_thread(job: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+    """Run ``job`` in a new thread. Pending commands may occupy all threads of asyncio's pool."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        return await asyncio.get_running_loop().run_in_executor(pool, job, *arguments)
+    finally:
+        pool.shutdown(wait=False)
 
 
 class AsyncSubscription(Subscriber[_Record]):
@@ -138,12 +148,12 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
         """
         attempts = Attempts(self._request(name, numbers), self.timeout)
         where, keys = self.command_address, self._keys
-        reply = await asyncio.to_thread(send_once, where, attempts, keys)
+        reply = await _in_own_thread(send_once, where, attempts, keys)
         while attempts.again(reply):
             await asyncio.sleep(RETRY_DELAY)
             if not attempts.remaining():  # The computer was suspended.
                 break
-            reply = await asyncio.to_thread(send_once, where, attempts, keys)
+            reply = await _in_own_thread(send_once, where, attempts, keys)
         return accepted(reply)
 
     async def _carry_out(self, command: str, **numbers: float | None) -> None:

@@ -112,6 +112,7 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
         if keys is not None:
             keys.guard(socket)
         try:
+            socket.setsockopt(zmq.IPV6, int("[" in address))
             socket.connect(address)
         except zmq.ZMQError as error:
             raise NoAnswer(f"{address}: {error}") from None

@@ -131,6 +131,7 @@ def subscribe(
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
         for topic in topics:
             socket.setsockopt(zmq.SUBSCRIBE, topic)
+        socket.setsockopt(zmq.IPV6, int("[" in address))
         socket.connect(address)
     except zmq.ZMQError:
         socket.close()

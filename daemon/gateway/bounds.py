@@ -47,6 +47,9 @@ TOTAL_QUEUE_LENGTH = 2048  # maximum number of queued requests, all clients comb
 TOTAL_RATE = 2000.0  # maximum number of requests per second, all clients combined
 CLIENT_RATE_MIN = 2.0  # guaranteed number of requests per second for each client
 RECOVERY_TIME = 0.05  # pause after which a flooding client's requests are accepted again [s]
+# Time after a restart of the gateway in which clients may deliver requests that they have queued in
+# the meantime [s]. libzmq reconnects after 0.1 s.
+RECONNECT_TIME = 1.0
 
 # Steps
 STEP_WAIT_MAX = 0.01  # maximum time that a step waits for messages [s]
@@ -72,3 +75,4 @@ class Config(NamedTuple):
     keys: str = ""  # folder created by `softfinger keys`
     stream_setting: str = "stream.address"  # setting name in errors about the stream address
     latest: str = ""  # address on which the first topic is published in single-frame messages
+    restarted: bool = False  # True if an earlier gateway process has exited

@@ -8,8 +8,10 @@ client exceeds its rate limit, its requests are refused until the client pauses.
 Each request is stamped with its arrival time and the number of preceding stops. The libzmq thread
 reads ahead, so the gateway can't determine whether a request arrived before or after a stop. After
 a stop or a long gap between two polls, the gateway therefore stamps new requests as older than the
-stop or the gap. Normal stamping resumes once the socket is empty and few requests arrive. Replies
-are also delayed for a limited time. Otherwise, a client could respond to a reply with a new request
+stop or the gap. Normal stamping resumes once the socket is empty and few requests arrive. After a
+restart of the gateway, clients deliver the requests that they have queued. The gateway therefore
+stamps all requests as old until the clients have had time to reconnect. Replies are also delayed
+for a limited time. Otherwise, a client could respond to a reply with a new request
 that the gateway would refuse.
 """
 
@@ -17,10 +19,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 from collections import deque
 from collections.abc import Callable
 
-import msgpack
 import zmq
 
 from softfinger.daemon.errors import Reason
@@ -29,8 +31,9 @@ from softfinger.daemon.gateway.endpoints import NO_WAIT, ClientSockets, read_par
 from softfinger.daemon.wire.command_server import refusal
 from softfinger.daemon.wire.loop_link import ASK, Ask, Channel
 
-# Packed strings cannot contain the byte sequence of a packed stop command.
-_PACKED_STOP = msgpack.packb("command") + msgpack.packb("stop")
+# A packed stop command, with both formats of short strings. Other packed strings cannot contain
+# these byte sequences.
+_PACKED_STOP = re.compile(rb"(\xa7|\xd9\x07)command(\xa4|\xd9\x04)stop")
 _MALFORMED_REFUSAL = refusal(
     "envelope: expected one frame that contains the command, optionally after an envelope that "
     f"ends with an empty frame and has at most {bounds.PART_COUNT_MAX - 2} frames and "
@@ -86,6 +89,12 @@ class CommandEndpoint:
         self._dated = math.inf
         self._unread_max = 0  # upper bound on the number of unread requests from the gap
         self._since = 0.0  # time of the last stop, gap or check for older requests
+        self._is_fenced = False  # True once the loop has sent a stop count
+        if config.restarted:
+            self._since = self._last_poll + bounds.RECONNECT_TIME
+            self._date(self._last_poll - 2.0 * bounds.RECONNECT_TIME)
+        self._tokens = bounds.TOTAL_RATE  # token bucket for the requests of all clients
+        self._counted = self._last_poll  # time of the last request
         self._arrived = 0  # number of requests since `_since`, excluding status requests
         self._replies: deque[list[bytes]] = deque()  # replies that have not been sent yet
         # Current delay of the replies [s]. One step adds at most REFUSAL_TIME, so a stall of the
@@ -103,19 +112,25 @@ class CommandEndpoint:
 
         Meanwhile, replies are delayed by at most `bounds.ANSWER_DELAY_MAX`.
         """
+        if not self._is_fenced:  # After a restart, this is the stop count of the last gateway.
+            self._is_fenced, self.stops, self._fence = True, stops, stops
         if self.stops == self._fence:
             self._held_for = 0.0
         self._fence = stops
-        self._since, self._arrived = self._clock(), 0
+        self._since, self._arrived = max(self._since, self._clock()), 0
+
+    def _date(self, t: float) -> None:
+        """Stamp requests with time t until all requests that may be older have been read."""
+        self._dated = min(self._dated, t)
+        self._unread_max = bounds.CLIENT_COUNT_MAX * bounds.SOCKET_QUEUE_LENGTH
 
     def read(self) -> None:
         """Read requests for up to `bounds.TURN_TIME`, then forward requests and send replies."""
         began = self._clock()
         gap, self._last_poll = began - self._last_poll, began
         if gap > bounds.POLL_GAP_MAX:
-            self._dated = min(self._dated, began - gap)
-            self._unread_max = bounds.CLIENT_COUNT_MAX * bounds.SOCKET_QUEUE_LENGTH
-            self._since, self._arrived = began, 0
+            self._date(began - gap)
+            self._since, self._arrived = max(self._since, began), 0
         self._held_for += min(gap, bounds.REFUSAL_TIME)
         while (now := self._clock()) < began + bounds.TURN_TIME:
             parts = read_parts(self.socket)
@@ -156,10 +171,15 @@ class CommandEndpoint:
         while self._clients and self._clients[oldest := next(iter(self._clients))].last < now - 1.0:
             del self._clients[oldest]
         self._clients[parts[0]] = client
-        share = max(bounds.TOTAL_RATE / len(self._clients), bounds.CLIENT_RATE_MIN)
+        # The clients share the total rate only if they exceed it together.
+        tokens = self._tokens + (now - self._counted) * bounds.TOTAL_RATE
+        self._tokens, self._counted = max(min(tokens, bounds.TOTAL_RATE) - 1.0, 0.0), now
+        share = math.inf
+        if not self._tokens:
+            share = max(bounds.TOTAL_RATE / len(self._clients), bounds.CLIENT_RATE_MIN)
         is_flood = client.floods(min(self._config.per_second, share), now)
-        is_stop = _PACKED_STOP in payload and len(payload) <= bounds.URGENT_SIZE_MAX
-        urgent = is_stop and not client.urgent
+        is_stop = len(payload) <= bounds.URGENT_SIZE_MAX and _PACKED_STOP.search(payload)
+        urgent = bool(is_stop) and not client.urgent
         ask = Ask(min(now, self._dated), self.stops, urgent, name, route, payload)
         error = b""
         if is_flood and not urgent:

@@ -76,6 +76,7 @@ class Gateway:
         self._wait()
         while not self._closing.wait(max(start_at - time.monotonic(), _RESTART_DELAY)):
             start_at = time.monotonic() + _START_INTERVAL
+            self._config = self._config._replace(restarted=True)
             try:
                 self._start()
                 if self._closing.is_set():  # `close` has closed only the previous channel.

@@ -3,7 +3,8 @@
 Each message is a msgpack list whose first element is the message kind. Sending never blocks. If the
 socket buffer is full, the remaining bytes are sent later. While bytes remain, stream messages are
 dropped, but replies and stops are queued. The gateway limits the number of pending requests, so the
-queue of replies and stops is bounded.
+queue of replies and stops is bounded. If a message that is kept for late subscribers was dropped,
+the last messages of its topic are repeated later.
 """
 
 from __future__ import annotations
@@ -84,11 +85,16 @@ class Channel:
     def fileno(self) -> int:
         return self._end.fileno()
 
-    def send(self, *message: object, droppable: bool = False) -> None:
-        """Send a message. If the buffer is full, drop a ``droppable`` message; queue any other."""
-        if not self.over and (self.flush() or not droppable):
-            self._unsent += msgpack.packb(message)
-            self.flush()
+    def send(self, *message: object, droppable: bool = False) -> bool:
+        """Send a message. If the buffer is full, drop a ``droppable`` message; queue any other.
+
+        Returns False if the message was dropped.
+        """
+        if self.over or not (self.flush() or not droppable):
+            return False
+        self._unsent += msgpack.packb(message)
+        self.flush()
+        return True
 
     def flush(self) -> bool:
         """Send queued bytes; return True if the queue is empty afterwards."""
@@ -126,11 +132,13 @@ class Link:
         self.refused = 0  # number of requests refused by the gateway's rate and queue limits
         self.stops = 0  # number of stops so far
         self.confirmed = 0  # stop count with which the gateway stamps new requests
+        self._confirmed_before = 0  # the same count of the last gateway that has exited
         self.asked: deque[Ask] = deque()  # received requests, with urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
         self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings
         # Last messages of each topic, which are repeated to a restarted gateway.
         self._kept: dict[int, deque[bytes]] = {}
+        self._dropped: set[int] = set()  # topics whose kept messages must be repeated
         self._offered: Channel | None = None
         self._channel = Channel(socket.socket())  # replaced by `offer`
         self._channel.close()
@@ -144,9 +152,11 @@ class Link:
         if self._offered is not None:
             self.close()
             self._channel, self._offered = self._offered, None
-            for topic, kept in self._kept.items():
-                for message in kept:
-                    self._channel.send(PUBLISH, topic, kept.maxlen, repeated(message))
+            self._dropped.update(self._kept)
+            self._repeat()
+            # Requests that clients have queued since the last gateway exited are older than the
+            # stops in the meantime.
+            self._channel.send(FENCE, self._confirmed_before)
             self._channel.send(FENCE, self.stops)
         channel = self._channel
         if channel.over:
@@ -159,7 +169,17 @@ class Link:
                 (self.asked.appendleft if ask.urgent else self.asked.append)(ask)
         if channel.over:
             self.close()
+        if not channel.flush():
+            return False
+        self._repeat()
         return channel.flush()
+
+    def _repeat(self) -> None:
+        """Send the kept messages of the topics in `_dropped` again."""
+        while self._dropped:
+            kept = self._kept[topic := self._dropped.pop()]
+            for message in kept:
+                self._channel.send(PUBLISH, topic, kept.maxlen, repeated(message))
 
     def fence(self) -> None:
         """Refuse all requests that arrived before a stop, except ``stop`` and ``status``.
@@ -176,11 +196,13 @@ class Link:
         """Publish a message. Late subscribers receive the last ``keep`` messages of the topic."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append(message)
-        self._channel.send(PUBLISH, topic, keep, message, droppable=True)
+        if not self._channel.send(PUBLISH, topic, keep, message, droppable=True) and keep:
+            self._dropped.add(topic)
 
     def close(self) -> None:
         """Disconnect. The gateway then sends its queued messages and exits."""
         self._channel.close()
+        self._confirmed_before = max(self._confirmed_before, self.confirmed)
         self.wanted = self.confirmed = 0
         self.asked.clear()
         self.unpacked.clear()

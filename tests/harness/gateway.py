@@ -32,13 +32,16 @@ class Served:
         ipc_mode: int = 0o600,
         keys: str = "",
         latest: str = "",
+        restarted: bool = False,
         clock: VirtualClock | None = None,
+        link: loop_link.Link | None = None,
     ) -> None:
-        self.link = loop_link.Link()
+        self.link = link or loop_link.Link()
         ours, theirs = loop_link.pair()
         config = Config(
             *(stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys),
             latest=latest,
+            restarted=restarted,
         )
         try:
             now = loop_link.machine_time if clock is None else clock.now
@@ -52,7 +55,7 @@ class Served:
         self.server = CommandServer(self.link, clock=now)
         self._clock = clock
         self.settle()
-        until(lambda: not commands or self._is_open())
+        until(lambda: not commands or restarted or self._is_open())
 
     def _is_open(self) -> bool:
         """Return True if incoming commands are executed."""

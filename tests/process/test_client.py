@@ -15,6 +15,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+import zmq
 
 from softfinger import (
     AsyncHand,
@@ -603,3 +604,35 @@ def test_status_prints_one_line_or_the_complete_state_as_json(fake, inline):
     fake.changes = {"mode": "fault", "fault": "servo 1: overload"}
     failed = inline("status", "--address", fake.state_address)
     assert (failed.returncode, failed.stdout) == (1, "fault: servo 1: overload\n")
+
+
+def test_a_stop_does_not_wait_for_the_pending_commands_of_an_asyncio_program(fake):
+    """The default thread pool of asyncio has at most 36 threads."""
+    over = threading.Event()
+
+    async def stop() -> None:
+        async with AsyncHand(fake.state_address, fake.command_address, timeout=60.0) as hand:
+            pending = [asyncio.create_task(asyncio.to_thread(over.wait)) for _ in range(40)]
+            try:
+                await asyncio.wait_for(hand.stop(), 120.0)
+            finally:
+                over.set()
+            await asyncio.gather(*pending)
+
+    asyncio.run(stop())
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="needs IPv6")
+def test_commands_reach_an_ipv6_address():
+    with zmq.Context() as context, context.socket(zmq.REP) as server:
+        server.setsockopt(zmq.IPV6, 1)
+        port = server.bind_to_random_port("tcp://[::1]")
+
+        def reply() -> None:
+            server.recv()
+            server.send(msgpack.packb({"ok": True}))
+
+        thread = threading.Thread(target=reply)
+        thread.start()
+        assert command_client.send(f"tcp://[::1]:{port}", {"command": "status"}, 60.0)["ok"]
+        thread.join()

@@ -9,6 +9,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.gateway import bounds
+from softfinger.daemon.wire.loop_link import Channel, Link, pair
 from softfinger.daemon.wire.publisher import bit
 from softfinger.daemon.wire.schema import EVENT, STATE
 from tests.conftest import until
@@ -138,3 +139,70 @@ def test_unread_replies_are_dropped(served, context, addresses):
         client.recv()
         read += 1
     assert read < most
+
+
+def test_many_connections_do_not_limit_a_client_while_the_total_rate_is_low(addresses, context):
+    """A program that polls the status opens a connection for each request."""
+    clock = VirtualClock()
+    with Served(*addresses, per_second=200.0, clock=clock) as served:
+        client = Asking(context, served, addresses[1], "hold")
+        for _ in range(150):
+            clock.sleep_until(clock.now() + 0.02)
+            assert client.told()["ok"]
+            for _ in range(2):
+                assert is_served(served, context, addresses[1])
+            client.send("hold")
+
+
+@pytest.mark.parametrize("stops", [0, 1])
+def test_requests_that_waited_for_a_restart_of_the_gateway_are_old(
+    addresses, context, clock, stops
+):
+    link = Link()
+    with Served(*addresses, clock=clock, link=link) as served:
+        assert is_served(served, context, addresses[1])
+    link.look()
+    for _ in range(stops):
+        link.fence()
+    ages: list[float] = []
+
+    def note(request: dict[str, object], age: float) -> dict[str, object]:
+        ages.append(age)
+        return {}
+
+    with Served(*addresses, clock=clock, link=link, restarted=True) as served:
+        client = Asking(context, served, addresses[1], "arm")
+        until(served.has_request)
+        for _ in range(20):  # The gateway delays its replies.
+            served.serve(note)
+            clock.sleep_until(clock.now() + bounds.REFUSAL_TIME)
+        assert client.told(note).get("reason") == ("stopped" if stops else None)
+        assert [age > 1.0 for age in ages] == [True] * (1 - stops)
+        clock.sleep_until(clock.now() + bounds.RECONNECT_TIME)
+        for _ in range(3):
+            served._is_open()
+        assert Asking(context, served, addresses[1], "arm").told(note)["ok"]
+        assert ages[-1] < 1.0
+
+
+@pytest.mark.parametrize("prefix", [b"\xa7command\xa4", b"\xd9\x07command\xd9\x04"])
+def test_a_stop_is_urgent_in_each_format_of_short_strings(served, context, addresses, prefix):
+    client = Asking(context, served, addresses[1], b"\x81" + prefix + b"stop")
+    until(lambda: served.settle() or served.link.asked)
+    assert served.link.asked[0].urgent
+    client.socket.close(0)
+
+
+def test_kept_messages_are_repeated_if_the_gateway_did_not_read():
+    link, (ours, theirs) = Link(), pair()
+    link.offer(Channel(ours))
+    link.look()
+    for _ in range(20):
+        link.publish(0, bytes(1 << 18))
+    link.publish(1, b"an event", keep=5)
+    gateway, received = Channel(theirs), []
+    event = ["publish", 1, 5, b"an event"]
+    until(lambda: [link.look(), received.extend(gateway.receive()), event in received][-1])
+    assert len(received) < 20
+    link.close()
+    gateway.close()

@@ -312,8 +312,9 @@ class Emulator:
         try:
             faults = [word for word in words if word not in _REQUESTS]
             # A client may have changed the IDs.
-            bus = self._servos and self._servos.bus
-            ids = self._ids if bus is None else tuple(servo.id for servo in bus.servos)
+            ids = self._ids
+            if self._servos is not None:
+                ids = tuple(servo.id for servo in self._servos.bus.servos)
             fresh = parse_faults(faults, ids)
         except FaultError as error:
             return f"error: {error}"
