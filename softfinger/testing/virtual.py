@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
 
 from softfinger.daemon.client.hand import Hand, Subscription
-from softfinger.daemon.client.stream import no_stream, read
+from softfinger.daemon.client.stream import Gaps, no_stream, read
 from softfinger.daemon.errors import NoStream, Reason, Refused, SettingsError
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
@@ -87,18 +88,30 @@ class VirtualSubscription(Subscription[Any]):
 
     def __init__(self, hand: VirtualTimeHand, topic: bytes, timeout: float | None) -> None:
         # Do not call the base class's constructor, because it would open a socket.
-        self.topic = topic
+        self._hand, self._thread, self._address = hand, hand._thread, hand.stream_address
+        self._topic, self._timeout = topic, timeout
+        self._gaps, self.unreadable = Gaps(), 0
+        self._socket = SimpleNamespace(closed=False)
         self.waiting: deque[Any] = deque(maxlen=_QUEUE)
-        self.is_open = True
-        self._hand = hand
-        self._timeout = timeout
+
+    def add(self, message: dict[str, Any]) -> None:
+        """Queue the record of a message; drop the oldest record if the queue is full."""
+        try:
+            record = read(schema.TOPICS[self._topic].record, message)
+        except ValueError:
+            self.unreadable += 1
+            return
+        if self._gaps.take(message):
+            self._gaps.lost += len(self.waiting) == _QUEUE
+            self.waiting.append(record)
 
     def next(self, timeout: float | None) -> Any:
         """Return the next record. Raises NoStream after ``timeout`` s of virtual time."""
+        self._require_open()
         begin = self._hand.t
         while not self.waiting:
             if timeout is not None and self._hand.t - begin >= timeout:
-                raise no_stream(self._hand.stream_address, self.topic, timeout)
+                raise no_stream(self._address, self._topic, timeout)
             self._hand.step()
         return self.waiting.popleft()
 
@@ -110,11 +123,13 @@ class VirtualSubscription(Subscription[Any]):
 
     def skip(self) -> None:
         """Drop queued records."""
+        self._require_open()
         self.waiting.clear()
 
     def close(self) -> None:
         """End the subscription."""
-        self.is_open = False
+        self._thread.claim()
+        self._socket.closed = True
         self._hand._select_topics()
 
 
@@ -149,6 +164,7 @@ class VirtualTimeHand(Hand):
 
     def step(self) -> None:
         """Advance by the smallest step: a tick, or a recorded message."""
+        self._require_open()
         if self._serving:
             raise RuntimeError(
                 "serve() is running and advances the clock itself; instead of this call, use a "
@@ -244,20 +260,22 @@ class VirtualTimeHand(Hand):
 
     def _select_topics(self) -> None:
         """Select the topics of the open subscriptions, or all topics while recording."""
-        self._subscriptions = [each for each in self._subscriptions if each.is_open]
+        self._subscriptions = [each for each in self._subscriptions if not each._socket.closed]
         self._link.tapped = 0 if self._writer is None else _EVERYTHING
         for each in self._subscriptions:
-            self._link.tapped |= bit(each.topic)
+            self._link.tapped |= bit(each._topic)
 
     def _take(self, topic: bytes, message: dict[str, Any]) -> None:
         for each in self._subscriptions:
-            if each.topic == topic:
-                each.waiting.append(read(schema.TOPICS[topic].record, message))
+            if each._topic == topic:
+                each.add(message)
         if self._writer is not None:
             self._writer.add(topic, message)
 
     def close(self) -> None:
-        """Switch the torque off and discard the hand."""
+        """End all subscriptions and discard the hand."""
+        for each in self._subscriptions:
+            each.close()
         super().close()
         self._temporary.cleanup()
 

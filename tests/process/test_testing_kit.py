@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from softfinger.daemon.errors import SettingsError
+from softfinger.daemon.errors import HandClosed, SettingsError
 from softfinger.daemon.simulation.emulator.folder import NoEmulator
 from softfinger.daemon.simulation.faults import FaultError
-from softfinger.testing import EmulatedBus, EmulatedHand, VirtualHand
+from softfinger.testing import EmulatedBus, EmulatedHand, VirtualHand, virtual
 from tests.harness.daemon_process import plugin_path, python
 
 SERVOS = """
@@ -245,6 +245,26 @@ def test_user_tests_pass(tmp_path, text, count):
     done = python("-m", "pytest", *options, folder, cwd=folder, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"{count} passed" in done.stdout
+
+
+def test_a_virtual_subscription_counts_and_closes_like_a_real_one(monkeypatch):
+    monkeypatch.setattr(virtual, "_QUEUE", 5)
+    hand = VirtualHand()
+    states, closed = hand.stream(), hand.stream()
+    before = hand.state()
+    for _ in range(8):
+        hand.state()
+    assert (states.lost, states.unreadable) == (4, 0)
+    assert repr(states) == f"VirtualSubscription: hand/state from {hand.stream_address}, 4 lost"
+    assert next(states).seq > before.seq
+    closed.close()
+    for use in (closed.skip, lambda: closed.next(None)):
+        with pytest.raises(HandClosed, match="this subscription is closed"):
+            use()
+    hand.close()
+    for use in (hand.state, hand.step, lambda: hand.run(0.1), lambda: next(states)):
+        with pytest.raises(HandClosed, match="is closed: create a new one"):
+            use()
 
 
 def test_unusable_hands_and_faults_are_refused(capfd):
