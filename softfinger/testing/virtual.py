@@ -23,7 +23,14 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.faults import FaultError, FaultEvent, parse_faults
+from softfinger.daemon.simulation.faults import (
+    MEASUREMENT_FAULTS,
+    OBJECT,
+    WELL,
+    FaultError,
+    FaultEvent,
+    parse_faults,
+)
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.command_server import CommandServer
@@ -343,19 +350,20 @@ class VirtualHand(VirtualTimeHand):
         FaultError
             If a word is unknown, or if a fault requires servos and boards as in `EmulatedHand`.
         """
-        for event in parse_faults(words, ()):
-            self._faults.append(event._replace(after=event.after + self.t))
+        events = [(word, event) for word in words for event in parse_faults([word], ())]
+        for word, event in events:
+            if event.part != OBJECT and event.kind not in (*MEASUREMENT_FAULTS, WELL):
+                raise FaultError(
+                    f"fault {word!r}: found a servo or board fault, expected a measurement fault "
+                    "or a load; emulated_hand supports all faults"
+                )
+        self._faults += [event._replace(after=event.after + self.t) for _, event in events]
         self._faults.sort(key=lambda event: event.after)
         self._apply_faults()
 
     def _apply_faults(self) -> None:
         while self._faults and self._faults[0].after <= self.t:
-            event = self._faults.pop(0)
-            if not self.plant.apply_fault(event):
-                raise FaultError(
-                    f"{event}: found a servo or board fault, expected a measurement fault or a "
-                    "load; emulated_hand supports all faults"
-                )
+            self.plant.apply_fault(self._faults.pop(0))
 
     @contextlib.contextmanager
     def record(self, path: Path | str) -> Iterator[None]:

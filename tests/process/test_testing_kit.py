@@ -279,9 +279,15 @@ def test_unusable_hands_and_faults_are_refused(capfd):
         with pytest.raises(ValueError, match=f"ids: found {count} servos, expected 1 to 8"):
             EmulatedBus(ids=range(count))
     with EmulatedBus(ids=[4]) as bus, VirtualHand() as hand:
-        for kit, word in ((bus, "left:silent"), (bus, "drop=1@2"), (hand, "left:silent")):
+        for word in ("left:silent", "drop=1@2"):
             with pytest.raises(FaultError, match="expected"):
-                kit.fault(word)
+                bus.fault(word)
+        for word in ("left:silent", "frozen@0.5", "drop=1@2", "right:plug@2"):
+            with pytest.raises(FaultError, match=f"fault '{word}': found a servo or board fault"):
+                hand.fault("gain=2@1", word)
+        assert not hand._faults
+        hand.fault("twist=0.1", "gain=2@1", "left:well@2", "well")
+        assert [event.after - hand.t for event in hand._faults] == pytest.approx([1, 1, 2])
         with pytest.raises(FaultError, match="no servo has this ID"):
             bus.fault("silent=3")
         assert Path(bus.port).is_char_device()
