@@ -367,7 +367,15 @@ class VirtualHand(VirtualTimeHand):
 
     @contextlib.contextmanager
     def record(self, path: Path | str) -> Iterator[None]:
-        """Record all topics to a new file until the context ends; requires the extra ``record``."""
+        """Record all topics to a new file until the context ends; requires the extra ``record``.
+
+        Raises RuntimeError if another recording of this hand has not ended.
+        """
+        if self._writer is not None:
+            raise RuntimeError(
+                f"record {path}: found a recording in progress, expected none; leave the other "
+                "record() context first"
+            )
         self._writer = RecordingWriter(Path(path))
         for topic, message in self._link.kept():
             self._writer.add(topic, message)
@@ -447,6 +455,11 @@ class RecordedHand(VirtualTimeHand):
 
     def _send(self, request: dict[str, Any]) -> dict[str, Any]:
         return {"ok": True, **self._note(request)}
+
+    def close(self) -> None:
+        """Close the recording and discard the hand."""
+        super().close()
+        self._messages.close()
 
     def _note(self, request: dict[str, Any], _age: float = 0.0) -> dict[str, Any]:
         if request["command"] != "status":

@@ -8,7 +8,7 @@ import pytest
 from softfinger.daemon.errors import HandClosed, SettingsError
 from softfinger.daemon.simulation.emulator.folder import NoEmulator
 from softfinger.daemon.simulation.faults import FaultError
-from softfinger.testing import EmulatedBus, EmulatedHand, VirtualHand, virtual
+from softfinger.testing import EmulatedBus, EmulatedHand, RecordedHand, VirtualHand, virtual
 from tests.harness.daemon_process import plugin_path, python
 
 SERVOS = """
@@ -265,6 +265,19 @@ def test_a_virtual_subscription_counts_and_closes_like_a_real_one(monkeypatch):
     for use in (hand.state, hand.step, lambda: hand.run(0.1), lambda: next(states)):
         with pytest.raises(HandClosed, match="is closed: create a new one"):
             use()
+
+
+def test_recordings_are_closed(tmp_path):
+    path = tmp_path / "run.mcap"
+    with VirtualHand() as hand, hand.record(path):
+        other = hand.record(tmp_path / "other.mcap")
+        with pytest.raises(RuntimeError, match="found a recording in progress"), other:
+            pass
+        hand.run(0.3)
+    with RecordedHand(path) as played:
+        played.run(0.2)
+        assert path in (each.resolve() for each in Path("/proc/self/fd").iterdir())
+    assert path not in (each.resolve() for each in Path("/proc/self/fd").iterdir())
 
 
 def test_unusable_hands_and_faults_are_refused(capfd):

@@ -12,7 +12,7 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Protocol
@@ -184,7 +184,7 @@ class Recording:
         start: float = -math.inf,
         end: float = math.inf,
         progress: Callable[[int], None] | None = None,
-    ) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    ) -> Generator[tuple[bytes, dict[str, Any]], None, None]:
         """Yield the topic and stream map of each message from ``start`` to ``end`` [s].
 
         Times are relative to the recording's first message. ``progress`` is called with the number
