@@ -230,14 +230,6 @@ def _hands() -> Iterator[PublishedValue]:
                   "reaction in 35 to 40 ms, arXiv 2602.16127; humans 100 ms, Delhaye 2024",
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
     yield PublishedValue(
-        "friction in the servo gears",
-        "depends on the load",
-        "Rhoban, arXiv 2410.08650",
-        f"{Settings().simulation.joint_friction:g} N·m",
-        "disagree",
-        "simulated as Coulomb friction, which is independent of the load",
-    )
-    yield PublishedValue(
         "all results on physical hardware",
         "—",
         "none yet",
