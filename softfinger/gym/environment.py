@@ -66,7 +66,9 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     profile
         Profile of the simulated hand, or None for the default settings.
     changes
-        Changes to settings, in the same form as for ``--set``.
+        Changes to settings, in the same form as for ``--set``. Each episode draws the object's
+        width, mass, angle and x position, the tip friction and the seed, and ignores changes to
+        these settings.
     shaped
         Add potential-based shaping to the reward of ``grasp``: up to 10 for closing the fingers
         and up to 10 for both forces. Shaping rewards progress before the first touch and leaves the
@@ -143,7 +145,10 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode with a new object; ``options`` may contain a ``goal``."""
+        """Start an episode with a new object; ``options`` may contain a ``goal``.
+
+        Raises RuntimeError if the hand cannot grip the object for ``rotate`` or ``push``.
+        """
         super().reset(seed=seed)
         self._end_episode()
         drawn = self._drawn()
@@ -207,7 +212,13 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _until(self, condition: Callable[[], bool]) -> None:
         finish = self._loop.state.t + _GRIP_TIMEOUT
-        while not condition() and self._loop.state.t < finish:
+        while not condition() or self._refused:
+            if self._refused or self._loop.state.t >= finish:
+                reason = self._loop.state.fault or self._refused or "the grip takes too long"
+                raise RuntimeError(
+                    f"reset: the hand does not hold the object ({reason}); change the profile, or "
+                    "use the task 'grasp'"
+                )
             self._loop.advance(STEP)
 
     def step(

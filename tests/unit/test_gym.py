@@ -170,6 +170,16 @@ def test_the_baseline_closes_each_finger_based_on_its_own_features():
     assert pressed[1] == free[1]
 
 
+@pytest.mark.parametrize(
+    ("control", "reason"), [("joints", "joint has stalled|takes too long"), ("law", "at most 2.7")]
+)
+def test_a_reset_without_a_grip_is_an_error(control, reason):
+    env = SoftFingerEnv("push", control, profile="small")
+    with pytest.raises(RuntimeError, match=f"not hold the object .*({reason})"):
+        env.reset(seed=2)
+    env.close()
+
+
 @pytest.mark.parametrize("control", ["joints", "law"])
 def test_a_nan_action_is_refused_and_the_episode_continues(control):
     task = "grasp" if control == "joints" else "rotate"
