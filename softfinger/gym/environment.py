@@ -70,9 +70,9 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         width, mass, angle and x position, the tip friction and the seed, and ignores changes to
         these settings.
     shaped
-        Add potential-based shaping to the reward of ``grasp``: up to 10 for closing the fingers
-        and up to 10 for both forces. Shaping rewards progress before the first touch and leaves the
-        optimal policy unchanged [1]_.
+        Add potential-based shaping [1]_ to the reward of ``grasp``: up to 10 for closing the
+        fingers and up to 10 for both forces. Shaping rewards progress before the first touch. It
+        may change the optimal policy, because the final potential remains in the return.
     render_mode
         ``rgb_array`` makes `render` return an image [300, 550, 3]; ``human`` shows each step in a
         window, at real-time speed or slower.
