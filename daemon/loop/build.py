@@ -39,6 +39,22 @@ if TYPE_CHECKING:
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
 
+def make_hand(settings: Settings, t: float) -> SimulatedHand | None:
+    """Return the simulated hand at time ``t`` [s], or None if no backend requires one.
+
+    The simulated tips use the material from the settings, even if a calibration defines another
+    material.
+    """
+    if not needs_hand(settings.servos.backend, settings.tactile.backend):
+        return None
+    from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+
+    table = make_table(settings, make_material(settings.material))
+    own = backend("servos", settings.servos.backend).hand
+    made: SimulatedHand = (own if callable(own) else SimulatedHand)(settings, t, table)
+    return made
+
+
 class Daemon:
     """Daemon that is ready to run: ``with Daemon(settings) as daemon: daemon.loop.run()``.
 
@@ -86,7 +102,7 @@ class Daemon:
         scene = WantedScene(settings, on_event)
         self.models = scene.models
         warm_up(scene)
-        self.hand = self._make_hand()
+        self.hand = make_hand(self._hand_settings, self.clock.now())
         self.servos = make_servos(settings, self.clock, self.hand)
         perception = Perception(settings, self._make_sensors(), self.models)
         if self.gateway is not None:
@@ -145,25 +161,6 @@ class Daemon:
         if local.notice:
             gateway.link.notices.append(local.notice)
         return Publisher(gateway.link), CommandServer(gateway.link, local)
-
-    def _make_hand(self) -> SimulatedHand | None:
-        """Return the simulated hand, or None if no backend requires one.
-
-        The simulated tips use the material from the settings, even if a calibration defines another
-        material.
-        """
-        settings = self.settings
-        if not needs_hand(settings.servos.backend, settings.tactile.backend):
-            return None
-        from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-
-        real = self._hand_settings
-        table = make_table(real, make_material(real.material))
-        own = backend("servos", settings.servos.backend).hand
-        made: SimulatedHand = (own if callable(own) else SimulatedHand)(
-            real, self.clock.now(), table
-        )
-        return made
 
     def _make_sensors(self) -> dict[int, TactileSensor]:
         made = {}

@@ -11,7 +11,8 @@ import time
 
 import numpy as np
 
-from softfinger.daemon.clock import make_clock
+from softfinger.daemon.clock import Clock, make_clock
+from softfinger.daemon.loop.build import make_hand
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Servos, make_servos
@@ -32,13 +33,14 @@ def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) 
     object in the hand.
     """
     clock = make_clock(settings)
+    hand = make_hand(settings, clock.now())
     for name in settings.scene.fingers:
-        sensor = make_sensor(settings, clock, None, FINGERS.index(name))
+        sensor = make_sensor(settings, clock, hand, FINGERS.index(name))
         assert sensor is not None, "tactile.backend: found none, expected a board"
         for _ in range(2):  # The daemon reopens a board whose port was lost.
             sensor.open()
             try:
-                _check_frames(settings, sensor, frames, time.monotonic() + patience)
+                _check_frames(settings, clock, sensor, frames, time.monotonic() + patience)
                 _check_counters(sensor)
             finally:
                 sensor.close()
@@ -46,7 +48,9 @@ def check_tactile(settings: Settings, frames: int = 20, patience: float = 10.0) 
         sensor.close()
 
 
-def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadline: float) -> None:
+def _check_frames(
+    settings: Settings, clock: Clock, sensor: TactileSensor, frames: int, deadline: float
+) -> None:
     shape = (settings.tactile.rows, settings.tactile.cols)
     last: Frame | None = None
     kept = np.zeros(shape, np.uint16)
@@ -55,7 +59,7 @@ def _check_frames(settings: Settings, sensor: TactileSensor, frames: int, deadli
             assert time.monotonic() < deadline, (
                 f"found {count} frames within the test time, expected {frames}"
             )
-            time.sleep(_POLL)
+            clock.sleep_until(clock.now() + _POLL)
         assert isinstance(frame, Frame), f"found {type(frame).__name__}, expected a Frame"
         found = f"{frame.data.dtype} {frame.data.shape}"
         assert found == f"uint16 {shape}", f"found data {found}, expected uint16 {shape}"
@@ -81,15 +85,16 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
     off. While torque is on, the joints must not move by more than 0.05 rad. ``patience`` [s] is the
     maximum duration of each wait.
     """
-    servos = make_servos(settings, make_clock(settings), None)
+    clock = make_clock(settings)
+    servos = make_servos(settings, clock, make_hand(settings, clock.now()))
     assert servos is not None, "servos.backend: found none, expected servos"
     for _ in range(2):  # The daemon reconnects to servos that have stopped replying.
         servos.connect()
         try:
             reading = Reading()
-            _read(servos, reading, patience)
+            _read(servos, clock, reading, patience)
             first, seq = list(reading.q), reading.seq
-            _read(servos, reading, patience)
+            _read(servos, clock, reading, patience)
             assert reading.seq > seq, f"found seq {reading.seq} after seq {seq}"
             assert reading.t <= time.monotonic(), "found a reading with a time in the future"
             assert np.isfinite([*reading.q, *reading.dq, *reading.current]).all(), "found NaN"
@@ -97,7 +102,7 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
             if torque:
                 servos.torque_on()
                 servos.write(Goal(q=list(reading.q), current=[0.1, 0.1], valid=True))
-                _read(servos, reading, patience)
+                _read(servos, clock, reading, patience)
                 moved = np.abs(np.subtract(reading.q, first)).max()
                 assert moved < 0.05, (
                     f"the joints moved by {moved:.3g} rad when torque was switched on"
@@ -112,12 +117,12 @@ def check_servos(settings: Settings, torque: bool = False, patience: float = 2.0
     servos.close()
 
 
-def _read(servos: Servos, reading: Reading, patience: float) -> None:
+def _read(servos: Servos, clock: Clock, reading: Reading, patience: float) -> None:
     deadline = time.monotonic() + patience
     reading.valid = False
     while not reading.valid:
         assert time.monotonic() < deadline, "no valid reading arrived within the test time"
-        time.sleep(_POLL)
+        clock.sleep_until(clock.now() + _POLL)
         servos.read(reading)
 
 

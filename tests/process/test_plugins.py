@@ -19,6 +19,7 @@ from tests.conftest import until
 from tests.harness.daemon_process import PATIENT, pip_installed
 
 EXAMPLE = Path(__file__).parents[1] / "example_plugin"
+EXTENDED = pytest.mark.extended
 METAL = ("tactile.backend=pulsing", "servos.backend=following")
 
 
@@ -45,6 +46,16 @@ def test_the_example_meets_the_backend_interface(caplog):
     assert found["servos"].text.startswith("following: the servos use a plugin")
     assert "44 × 44 cells" in found["tactile left"].text
     assert "/dev/ttyUSB0" not in found  # Ports of plugin backends are not checked.
+
+
+@pytest.mark.parametrize("servos", ["simulated", pytest.param("mujoco", marks=EXTENDED)])
+@pytest.mark.parametrize("clock", ["virtual", pytest.param("auto", marks=EXTENDED)])
+def test_the_checks_support_backends_that_use_the_simulated_hand(servos, clock):
+    if servos == "mujoco":
+        pytest.importorskip("mujoco")
+    settings = load(changes=[f"servos.backend={servos}", f"loop.clock={clock}"])
+    check_tactile(settings)
+    check_servos(settings, torque=True)
 
 
 @pytest.mark.usefixtures("here")
