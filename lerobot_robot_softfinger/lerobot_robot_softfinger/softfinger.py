@@ -12,6 +12,7 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 from lerobot_robot_softfinger.config_softfinger import SoftfingerConfig
 from lerobot_robot_softfinger.features import IMAGES, JOINTS, STATE, image, observation
 from softfinger import Hand, NoStream
+from softfinger.daemon.control.modes import GRIPPING_MODES, Mode
 from softfinger.daemon.wire.schema import TactileFrame
 
 
@@ -64,10 +65,11 @@ class Softfinger(Robot):
             self._frames: dict[str, TactileFrame] = {}
             while len(self._frames) < len(IMAGES):
                 self._take(self._waiting.next(config.timeout))
+            self._gripping = hand.state().mode in GRIPPING_MODES
         except BaseException:
             hand.close()
             raise
-        self._hand, self._armed, self._gripping = hand, False, False
+        self._hand, self._armed = hand, False
 
     def _take(self, frame: TactileFrame) -> None:
         size, expected = (frame.rows, frame.cols), (self.config.rows, self.config.cols)
@@ -109,7 +111,8 @@ class Softfinger(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Command joint goals [rad], or the grip force [N] and object angle [rad].
 
-        Returns the commanded values. Raises Refused if a value is outside the hand's limits.
+        Returns the commanded values. While the hand opens, no force or angle is commanded, and both
+        values are 0. Raises Refused if a value is outside the hand's limits.
         """
         numbers = {name: float(np.asarray(action[name]).item()) for name in self.action_features}
         if not self._armed:
@@ -126,11 +129,11 @@ class Softfinger(Robot):
             if self._gripping:
                 self._hand.release()
             self._gripping = False
-            return {"grip.force": 0.0, "grip.angle": 0.0}
-        if self._gripping or self._hand.state().mode != "releasing":
+        elif self._gripping or self._hand.state().mode != Mode.RELEASING:
             self._hand.hold(force, angle)
             self._gripping = True
-        return {"grip.force": force, "grip.angle": angle}
+            return {"grip.force": force, "grip.angle": angle}
+        return {"grip.force": 0.0, "grip.angle": 0.0}
 
     @check_if_not_connected
     def disconnect(self) -> None:

@@ -2,9 +2,11 @@
 
 import math
 import runpy
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from softfinger import Refused
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.schema import HandState, TactileFrame
+from softfinger.testing import VirtualHand
 from tests.conftest import Addresses
 from tests.harness.daemon_process import PATIENT, pip_installed
 from tests.harness.golden_wire import sample
@@ -188,7 +191,8 @@ def record(kind, robot, first, action, moved, root):
 
 
 # Run the module by its path, because importing the package would import LeRobot.
-features = runpy.run_path(str(PACKAGE / "lerobot_robot_softfinger" / "features.py"))
+MODULES = PACKAGE / "lerobot_robot_softfinger"
+features = runpy.run_path(str(MODULES / "features.py"))
 STATE, image, observation = (features[name] for name in ("STATE", "image", "observation"))
 
 
@@ -231,3 +235,35 @@ def test_an_image_is_linear_and_saturates_at_full_scale():
     assert found.shape == (2, 3, 3)
     for channel in range(3):
         np.testing.assert_array_equal(found[:, :, channel], [[0, 3, 128], [255, 255, 255]])
+
+
+def test_a_robot_opens_a_grip_that_it_found_and_returns_the_sent_actions(monkeypatch):
+    robot = type("Robot", (), {"__init__": lambda self, config: None})
+    unchecked = dict.fromkeys(("check_if_already_connected", "check_if_not_connected"), lambda f: f)
+    # Replace the parts of LeRobot that the robot needs, because LeRobot may not be installed.
+    for name, contents in {
+        "lerobot.robots": {"Robot": robot},
+        "lerobot.utils.decorators": unchecked,
+        "lerobot_robot_softfinger.config_softfinger": {"SoftfingerConfig": object},
+        "lerobot_robot_softfinger.features": features,
+    }.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**contents))
+    times = dict.fromkeys(("timeout", "start_timeout"), 5.0)
+    config = SimpleNamespace(
+        control="law", least_force=0.5, rows=44, cols=44, address=None, keys=None, **times
+    )
+    with VirtualHand() as hand:
+        monkeypatch.setattr("softfinger.Hand", lambda *_, **__: hand)
+        made = runpy.run_path(str(MODULES / "softfinger.py"))["Softfinger"](config)
+        hand.arm()
+        hand.grasp(force=5.0)
+        hand.wait_for(lambda state: state.mode == "holding")
+        made.connect()
+        grip = {"grip.force": 5.0, "grip.angle": 0.1}
+        opened = {"grip.force": 0.0, "grip.angle": 0.0}
+        assert made.send_action({"grip.force": 0.4, "grip.angle": 0.1}) == opened
+        assert hand.state().mode == "releasing"
+        assert made.send_action(grip) == opened  # The hand first opens completely.
+        hand.wait_for(lambda state: state.mode == "armed")
+        assert made.send_action(grip) == grip
+        assert hand.state().mode == "grasping"
