@@ -283,6 +283,9 @@ def predict(
     """
     h = hands[0]
     h.is_gripping = is_gripping
+    if not is_gripping:
+        h.grasp.rejects_frames[:] = 0.0
+        h.tip[0].rejected_count = h.tip[1].rejected_count = 0
     dt = t - h.t
     last_speed = h.tip[0].speed, h.tip[1].speed
     for k in range(2):

@@ -89,7 +89,7 @@ def images(tip: Fingertip, cells: Grid, blur: float) -> FloatArray:
         offset = (np.arange(points) + 0.5) / points - 0.5
         at_x = x[cols, None, None] + width * offset
         at_y = y[rows, None, None] + height * offset[:, None]
-        out[:, chosen.ravel()] = list(_means(tip, (at_x + 1j * at_y).reshape(len(rows), -1)))
+        out[:, chosen.ravel()] = list(_means(tip, (at_x + 1j * at_y).reshape(len(rows), points**2)))
     return out
 
 

@@ -241,3 +241,18 @@ def test_only_a_recurring_order_is_a_repetition(name: str) -> None:
     frames, expected = SEQUENCES[name]
     assert given(RepeatDetector(100.0, 10.0), frames()) is expected
     assert not given(RepeatDetector(100.0, 10.0, enabled=False), frames())
+
+
+def test_rejected_frames_are_forgotten_after_the_grip():
+    with Hand({}) as hand:
+        grasped(hand, FORCE)
+        faults, rejects = hand.plant.measurement_faults[1], hand.estimator.grasp.rejects_frames
+        faults.begin("shift-x", 3.0, hand.plant.t)
+        while not rejects[1]:
+            hand.run(0.01)
+        hand.run(0.5)
+        assert hand.mode == "fault"
+        faults.clear()
+        hand.command("clear")
+        hand.run(0.1)
+        assert not rejects.any()

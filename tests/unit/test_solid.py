@@ -130,6 +130,13 @@ def test_the_estimate_reaches_its_bound_for_any_shear(tip, counts):
     assert 0.7 < np.mean(squares) < 1.4
 
 
+def test_a_sensor_smaller_than_the_tip_estimates_the_contact():
+    tip, grid = TIPS[0], SensorGrid(16, 16, 1.5e-3)
+    found = ContactEstimator(tip, RUBBER, grid, NOISE)(grid.pressure(tip, RUBBER, 3e-3, 0.1))
+    assert found.valid
+    assert (found.d, found.tilt_x) == pytest.approx((3e-3, 0.1), rel=0.02)
+
+
 def test_frames_of_other_elements_are_estimated_correctly():
     rng = np.random.default_rng(6)
     with np.load(Path(__file__).parents[1] / "golden" / "solid_frames.npz") as file:
