@@ -31,7 +31,7 @@ added for the setpoint.
 built-in hand. Loads below half of this value are ignored. The estimate of a larger load is
 increased by the load that friction may hide. An unconfirmed load increases the grip force by at
 most the fraction _UNCONFIRMED_SHARE. A load is confirmed when the object rotates, when both joints
-yield simultaneously, or when |L| exceeds 2 joint_friction/load_arm.
+yield simultaneously, or when the load without ``lead`` exceeds 2 joint_friction/load_arm.
 
 **Sudden events** increase the force immediately. The force increases to its limit if the torques
 jump by more than the noise while both joints yield. With solid tips, a jump in the measured shear
@@ -419,19 +419,29 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     deviation = residual - s.offset
     s.slow_deviation += (deviation - s.slow_deviation) * law.dt / _AVERAGE_TIME
     ahead = law.lead * (deviation - s.slow_deviation)
-    # If the residual changes because friction decreases or reverses, the change is not a load.
-    deviation += ahead
-    increase = residual + ahead - s.start_offset
-    s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
-    load, slope = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
-    load = abs(load)
+    increase = residual - s.start_offset
+    s.deviation = _without_friction(deviation, increase)
     hidden = s.joint_friction / grasp.load_arm
-    s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
+    present, _ = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
+    s.is_confirmed = s.is_confirmed or abs(present) > 2.0 * hidden
+    extrapolated = _without_friction(deviation + ahead, increase + ahead)
+    load, slope = load_of(extrapolated, grasp.load_arm, grasp.load_curvature)
+    load = abs(load)
     # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. The
     # estimate then rises to |L| + `hidden` at |L| = `hidden`.
     ignored = 0.5 * hidden
     hidden = s.joint_friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - ignored), 0.0), load + hidden, law.tip_friction * s.force_limit)
+
+
+@inner_kernel
+def _without_friction(deviation: float, increase: float) -> float:
+    """Return the part of the ``deviation`` from the offset that may be a load [N·m].
+
+    ``increase`` is the difference from the initial offset. If the residual changes because friction
+    decreases or reverses, the change is not a load.
+    """
+    return min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
 
 
 @inner_kernel

@@ -307,9 +307,8 @@ class Converter:
 
     @property
     def quantum(self) -> float:
-        """Mean slope of a working cell's calibration curve [Pa per count], median of the cells."""
-        spans = np.maximum(self._full - self.zero, 1.0)[self.live]
-        return float(np.median(self._ends()[self.live] / spans)) if spans.size else 0.0
+        """Mean slope of the calibration curve [Pa per count]."""
+        return self.saturation / self._full
 
 
 def least_end(ends: FloatArray) -> float:
