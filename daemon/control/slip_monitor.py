@@ -4,7 +4,8 @@ On each tick, the monitor computes the quantities below. `SlipLaw`, `SlipState` 
 define the symbols.
 
     r         low-pass filtered torque residual of each joint; r̄ is the mean of both joints
-    e         r̄ − offset + lead · (r̄ − offset − the same difference, low-pass filtered again)
+    e         deviation + lead · (deviation − the low-pass filtered deviation), where the deviation
+              is the part of r̄ − offset that friction cannot explain
     L         load per tip: e = load_arm L + load_curvature L²                         (`load_of`)
     load      min(4 max(|L| − joint_friction/(2 load_arm), 0), |L| + joint_friction/slope), with
               slope = load_arm + 2 load_curvature L
@@ -25,7 +26,7 @@ relaxes, the lower end of the range is extended by _RELAXATION_SHARE of the tip 
 **Lead.** If a load grows at a constant rate, r̄ lags by the averaging time, and the grip force lags
 by the delay of its setpoint. The two averages in e differ by the averaging time, so ``lead`` times
 this difference predicts the load at the time when the force acts. At most one averaging time is
-added for the setpoint.
+added for the setpoint. A decreasing load is not extrapolated.
 
 **Load.** Friction hides loads of up to joint_friction/load_arm, which is 2 N per tip for the
 built-in hand. Loads below half of this value are ignored. The estimate of a larger load is
@@ -110,7 +111,7 @@ class SlipState(Record):
     balanced_torque: float  # torque that friction balances, not yet part of `offset` [N·m]
     start_offset: float  # part of the initial offset that friction can't explain [N·m]
     deviation: float  # part of the residual that is attributed to a load [N·m]
-    slow_deviation: float  # residual minus offset, low-pass filtered again [N·m]
+    slow_deviation: float  # `deviation`, low-pass filtered [N·m]
     moment: float  # moment of the tip forces at the start of the hold [N·m]
     holding_time: float  # time since the start of the hold, at most _SETTLING_TIME [s]
     load: float  # load per tip, including the part hidden by friction [N]
@@ -416,32 +417,24 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     )  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     _update_offset(s, grasp, residual, torque_change)
+    # If the residual changes because friction decreases or reverses, the change is not a load.
     deviation = residual - s.offset
-    s.slow_deviation += (deviation - s.slow_deviation) * law.dt / _AVERAGE_TIME
-    ahead = law.lead * (deviation - s.slow_deviation)
     increase = residual - s.start_offset
-    s.deviation = _without_friction(deviation, increase)
+    s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
     hidden = s.joint_friction / grasp.load_arm
     present, _ = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
     s.is_confirmed = s.is_confirmed or abs(present) > 2.0 * hidden
-    extrapolated = _without_friction(deviation + ahead, increase + ahead)
-    load, slope = load_of(extrapolated, grasp.load_arm, grasp.load_curvature)
+    s.slow_deviation += (s.deviation - s.slow_deviation) * law.dt / _AVERAGE_TIME
+    ahead = law.lead * (s.deviation - s.slow_deviation)
+    if ahead * s.deviation < 0.0:  # The load is not growing.
+        ahead = 0.0
+    load, slope = load_of(s.deviation + ahead, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
     # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. The
     # estimate then rises to |L| + `hidden` at |L| = `hidden`.
     ignored = 0.5 * hidden
     hidden = s.joint_friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - ignored), 0.0), load + hidden, law.tip_friction * s.force_limit)
-
-
-@inner_kernel
-def _without_friction(deviation: float, increase: float) -> float:
-    """Return the part of the ``deviation`` from the offset that may be a load [N·m].
-
-    ``increase`` is the difference from the initial offset. If the residual changes because friction
-    decreases or reverses, the change is not a load.
-    """
-    return min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
 
 
 @inner_kernel
