@@ -4,9 +4,7 @@ On each tick, the monitor computes the quantities below. `SlipLaw`, `SlipState` 
 define the symbols.
 
     r         low-pass filtered torque residual of each joint; r̄ is the mean of both joints
-    e         deviation + lead · (deviation − the low-pass filtered deviation), where the deviation
-              is the part of r̄ − offset that friction cannot explain
-    L         load per tip: e = load_arm L + load_curvature L²                         (`load_of`)
+    L         load per tip: r̄ − offset = load_arm L + load_curvature L²               (`load_of`)
     load      min(4 max(|L| − joint_friction/(2 load_arm), 0), |L| + joint_friction/slope), with
               slope = load_arm + 2 load_curvature L
     needed    max(load, pull, object_load/2)/usable_friction, stored as `needed_force`. `pull` is
@@ -23,16 +21,11 @@ r̄. Joint friction can explain an initial offset of up to ±`joint_friction`; `
 part beyond this range. The offset stays within ±`joint_friction` of `start_offset`. Because rubber
 relaxes, the lower end of the range is extended by _RELAXATION_SHARE of the tip moment.
 
-**Lead.** If a load grows at a constant rate, r̄ lags by the averaging time, and the grip force lags
-by the delay of its setpoint. The two averages in e differ by the averaging time, so ``lead`` times
-this difference predicts the load at the time when the force acts. At most one averaging time is
-added for the setpoint. A decreasing load is not extrapolated.
-
 **Load.** Friction hides loads of up to joint_friction/load_arm, which is 2 N per tip for the
 built-in hand. Loads below half of this value are ignored. The estimate of a larger load is
 increased by the load that friction may hide. An unconfirmed load increases the grip force by at
 most the fraction _UNCONFIRMED_SHARE. A load is confirmed when the object rotates, when both joints
-yield simultaneously, or when the load without ``lead`` exceeds 2 joint_friction/load_arm.
+yield simultaneously, or when |L| exceeds 2 joint_friction/load_arm.
 
 **Sudden events** increase the force immediately. The force increases to its limit if the torques
 jump by more than the noise while both joints yield. With solid tips, a jump in the measured shear
@@ -90,7 +83,6 @@ class SlipLaw(Record):
     friction_max: float  # maximum joint torque during an approach [N·m]
     load_held: float  # fraction of the tip moment that gear friction can balance
     object_load: float  # [N]
-    lead: float  # time for which a growing load is extrapolated, divided by _AVERAGE_TIME
     has_shear: bool  # True if the frames measure shear
     increase_max: float  # [N]
     increase_ratio: float  # maximum force increase as a fraction of the commanded force
@@ -111,7 +103,6 @@ class SlipState(Record):
     balanced_torque: float  # torque that friction balances, not yet part of `offset` [N·m]
     start_offset: float  # part of the initial offset that friction can't explain [N·m]
     deviation: float  # part of the residual that is attributed to a load [N·m]
-    slow_deviation: float  # `deviation`, low-pass filtered [N·m]
     moment: float  # moment of the tip forces at the start of the hold [N·m]
     holding_time: float  # time since the start of the hold, at most _SETTLING_TIME [s]
     load: float  # load per tip, including the part hidden by friction [N]
@@ -144,8 +135,6 @@ def configure(s: SlipState, settings: Settings) -> None:
     law.friction_max = control.approach_current * control.torque_constant
     law.load_held = control.load_held
     law.object_load = control.object_load
-    # The two running means of the force setpoint delay it by 0.75 · `control.smooth_time`.
-    law.lead = 1.0 + min(0.75 * control.smooth_time / _AVERAGE_TIME, 1.0)
     law.has_shear = settings.tip.physics == "solid"
     law.increase_max, law.increase_ratio = control.grip_raise_max, control.grip_raise_share
     s.usable_friction = max(1.0 - law.margin, _SPARE_MIN) * law.tip_friction
@@ -159,7 +148,7 @@ def reset(s: SlipState) -> None:
     """
     s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
     s.joint_friction = s.offset = s.start_offset = s.deviation = s.moment = s.holding_time = 0.0
-    s.balanced_torque = s.slow_deviation = 0.0
+    s.balanced_torque = 0.0
     s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
@@ -186,7 +175,6 @@ def begin(s: SlipState, grasp: GraspState) -> None:
         s.offset = mean(s.residual)
         s.start_offset = s.offset - clip(s.offset, s.joint_friction)
     s.moment = moment
-    s.slow_deviation = mean(s.residual) - s.offset
     s.rotation[:] = 0.0
     s.balanced_torque = 0.0
     s.q[:] = grasp.q
@@ -238,8 +226,6 @@ def update(
     s.has_turned = False
     if is_held:
         _estimate_load(s, grasp, mean(torques) - s.torque)
-        if sudden:  # The averaged residual has jumped, so it does not lag.
-            s.slow_deviation = s.deviation
         s.has_turned = _has_turned(s, grasp)
     s.rotation_seen[:] = grasp.unexplained_rotation
     s.torque = mean(torques)
@@ -421,15 +407,10 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     deviation = residual - s.offset
     increase = residual - s.start_offset
     s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
-    hidden = s.joint_friction / grasp.load_arm
-    present, _ = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
-    s.is_confirmed = s.is_confirmed or abs(present) > 2.0 * hidden
-    s.slow_deviation += (s.deviation - s.slow_deviation) * law.dt / _AVERAGE_TIME
-    ahead = law.lead * (s.deviation - s.slow_deviation)
-    if ahead * s.deviation < 0.0:  # The load is not growing.
-        ahead = 0.0
-    load, slope = load_of(s.deviation + ahead, grasp.load_arm, grasp.load_curvature)
+    load, slope = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
+    hidden = s.joint_friction / grasp.load_arm
+    s.is_confirmed = s.is_confirmed or load > 2.0 * hidden
     # Joint friction can hide loads of up to `hidden`. The estimate is 0 up to |L| = `hidden`/2. The
     # estimate then rises to |L| + `hidden` at |L| = `hidden`.
     ignored = 0.5 * hidden

@@ -247,6 +247,7 @@ def test_stale_data_are_marked(page, fake):
         assert page.text(".mode") == "holding"
         # A state becomes stale after at most 0.5 s.
         assert page("picture.patience.state + scene.period") <= 0.5
+        until(lambda: not old())
         fake.dead.add("left")
         until(lambda: old() == {"left"})
         assert "s old" in page.text(".left .age")
