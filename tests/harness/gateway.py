@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import select
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -83,6 +83,14 @@ class Served:
         self.service.step(0.0)
         self.server.serve(handler)
         self.service.step(0.0)
+
+    def settle_until(self, condition: Callable[[], object]) -> None:
+        """Deliver messages until ``condition`` is true."""
+        until(lambda: self.settle(1) or condition())
+
+    def serve_until(self, handler: Handler, condition: Callable[[], object]) -> None:
+        """Serve commands until ``condition`` is true."""
+        until(lambda: self.serve(handler) or condition())
 
     @contextmanager
     def serving(self, handler: Handler) -> Iterator[None]:

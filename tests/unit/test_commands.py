@@ -36,8 +36,16 @@ def echo(request: dict[str, Any], age: float) -> dict[str, Any]:
 
 
 @pytest.fixture
-def server(addresses: tuple[str, str]) -> Iterator[Served]:
-    with Served(commands=addresses[1]) as served, served.serving(echo):
+def served(addresses: tuple[str, str]) -> Iterator[Served]:
+    """Yield a gateway and a loop, which the test steps."""
+    with Served(commands=addresses[1]) as served:
+        yield served
+
+
+@pytest.fixture
+def server(served: Served) -> Iterator[Served]:
+    """Serve commands in a thread."""
+    with served.serving(echo):
         yield served
 
 
@@ -73,7 +81,7 @@ class Asking:
 
     def told(self, handler: Handler = echo) -> dict[str, Any]:
         """Serve requests until the reply arrives, and return the reply."""
-        until(lambda: [self._served.serve(handler), self.socket.poll(0)][1])
+        self._served.serve_until(handler, lambda: self.socket.poll(0))
         return msgpack.unpackb(self.socket.recv())
 
 
@@ -101,13 +109,12 @@ def test_a_plain_req_socket_gets_its_reply(server, addresses):
     ],
 )
 def test_malformed_commands_are_refused_and_the_server_continues(
-    context, addresses, payload, error
+    context, served, addresses, payload, error
 ):
-    with Served(commands=addresses[1]) as served:
-        reply = Asking(context, served, addresses[1], payload).told()
-        assert (reply["ok"], reply["reason"]) == (False, "request")
-        assert error in reply["error"]
-        assert Asking(context, served, addresses[1], "arm").told()["ok"] is True
+    reply = Asking(context, served, addresses[1], payload).told()
+    assert (reply["ok"], reply["reason"]) == (False, "request")
+    assert error in reply["error"]
+    assert Asking(context, served, addresses[1], "arm").told()["ok"] is True
 
 
 def test_malformed_multipart_messages_and_disconnecting_clients_have_no_effect(
@@ -130,10 +137,10 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
     monkeypatch.setattr(bounds, "UNANSWERED_MAX", under_way)
     with Served(commands=addresses[1]) as served:
         early = Asking(context, served, addresses[1], "arm")
-        until(lambda: [served.settle(1), served.link.asked][1])
+        served.settle_until(lambda: served.link.asked)
         asking = Asking(context, served, addresses[1], "status")
         queue = served.service.commands
-        until(lambda: [served.settle(1), len(served.link.asked) + queue.count == 2][1])
+        served.settle_until(lambda: len(served.link.asked) + queue.count == 2)
         served.link.fence()
         assert early.told()["reason"] == "stopped"
         assert asking.told() == {"ok": True, "heard": "status"}, (
@@ -143,7 +150,7 @@ def test_requests_before_a_fence_are_refused_and_later_ones_are_not(
         assert early.told() == {"ok": True, "heard": "arm"}
 
 
-def test_a_request_passes_few_functions(context, addresses):
+def test_a_request_passes_few_functions(context, served, addresses):
     """Count the daemon's functions that run for one request, from the socket to the handler."""
     passed: set[str] = set()
     heard = Heard()
@@ -154,16 +161,15 @@ def test_a_request_passes_few_functions(context, addresses):
         if event == "call" and not heard.requests and is_ours and code.co_name[0] != "<":
             passed.add(code.co_qualname)
 
-    with Served(commands=addresses[1]) as served:
-        asking = Asking(context, served, addresses[1], "arm")
-        asking.told()
-        asking.send("arm")
-        until(served.has_request)
-        sys.setprofile(note)
-        try:
-            until(lambda: [served.serve(heard), heard.requests][1])
-        finally:
-            sys.setprofile(None)
+    asking = Asking(context, served, addresses[1], "arm")
+    asking.told()
+    asking.send("arm")
+    until(served.has_request)
+    sys.setprofile(note)
+    try:
+        served.serve_until(heard, lambda: heard.requests)
+    finally:
+        sys.setprofile(None)
     assert {"CommandEndpoint.read", "Link.look", "CommandServer.serve"} < passed
     assert len(passed) <= 25 - 2, sorted(passed)
 
@@ -171,36 +177,34 @@ def test_a_request_passes_few_functions(context, addresses):
 ARM = msgpack.packb({"command": "arm"})
 
 
-def test_a_correlating_req_socket_gets_its_reply(context, addresses):
-    with Served(commands=addresses[1]) as served:
-        client = context.socket(zmq.REQ)
-        client.setsockopt(zmq.REQ_CORRELATE, 1)
-        client.setsockopt(zmq.REQ_RELAXED, 1)
-        client.connect(addresses[1])
-        for name in ("arm", "status"):
-            client.send(msgpack.packb({"command": name}))
-            until(lambda: [served.serve(echo), client.poll(0)][1])
-            assert msgpack.unpackb(client.recv()) == {"ok": True, "heard": name}
+def test_a_correlating_req_socket_gets_its_reply(context, served, addresses):
+    client = context.socket(zmq.REQ)
+    client.setsockopt(zmq.REQ_CORRELATE, 1)
+    client.setsockopt(zmq.REQ_RELAXED, 1)
+    client.connect(addresses[1])
+    for name in ("arm", "status"):
+        client.send(msgpack.packb({"command": name}))
+        served.serve_until(echo, lambda: client.poll(0))
+        assert msgpack.unpackb(client.recv()) == {"ok": True, "heard": name}
 
 
-def test_a_proxy_may_be_used(context, addresses):
-    with Served(commands=addresses[1]) as served:
-        front, back = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
-        port = front.bind_to_random_port("tcp://127.0.0.1")
-        back.connect(addresses[1])
-        client = context.socket(zmq.REQ)
-        client.connect(f"tcp://127.0.0.1:{port}")
-        client.send(ARM)
+def test_a_proxy_may_be_used(context, served, addresses):
+    front, back = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+    port = front.bind_to_random_port("tcp://127.0.0.1")
+    back.connect(addresses[1])
+    client = context.socket(zmq.REQ)
+    client.connect(f"tcp://127.0.0.1:{port}")
+    client.send(ARM)
 
-        def answered() -> int:
-            for one, other in ((front, back), (back, front)):
-                if one.poll(0):
-                    other.send_multipart(one.recv_multipart())
-            served.serve(echo)
-            return client.poll(0)
+    def answered() -> int:
+        for one, other in ((front, back), (back, front)):
+            if one.poll(0):
+                other.send_multipart(one.recv_multipart())
+        served.serve(echo)
+        return client.poll(0)
 
-        until(answered)
-        assert msgpack.unpackb(client.recv()) == {"ok": True, "heard": "arm"}
+    until(answered)
+    assert msgpack.unpackb(client.recv()) == {"ok": True, "heard": "arm"}
 
 
 @pytest.mark.parametrize(
@@ -219,20 +223,19 @@ def test_a_proxy_may_be_used(context, addresses):
     ],
 )
 def test_the_envelope_is_returned_with_the_reply_and_a_malformed_one_is_answered(
-    context, addresses, frames, envelope, heard
+    context, served, addresses, frames, envelope, heard
 ):
-    with Served(commands=addresses[1]) as served:
-        client = context.socket(zmq.DEALER)
-        client.connect(addresses[1])
-        client.send_multipart(frames)
-        until(lambda: [served.serve(echo), client.poll(0)][1])
-        *back, reply = client.recv_multipart()
-        assert back == frames[:envelope]
-        if heard:
-            assert msgpack.unpackb(reply) == {"ok": True, "heard": "arm"}
-        else:
-            assert msgpack.unpackb(reply)["reason"] == "request"
-            assert "expected one frame that contains the command" in msgpack.unpackb(reply)["error"]
+    client = context.socket(zmq.DEALER)
+    client.connect(addresses[1])
+    client.send_multipart(frames)
+    served.serve_until(echo, lambda: client.poll(0))
+    *back, reply = client.recv_multipart()
+    assert back == frames[:envelope]
+    if heard:
+        assert msgpack.unpackb(reply) == {"ok": True, "heard": "arm"}
+    else:
+        assert msgpack.unpackb(reply)["reason"] == "request"
+        assert "expected one frame that contains the command" in msgpack.unpackb(reply)["error"]
 
 
 class Aged:
@@ -255,7 +258,7 @@ def pass_time(clock: VirtualClock, seconds: float) -> None:
 def on_the_link(served: Served) -> None:
     """Wait until the gateway has forwarded a request."""
     link = [served.link._channel]
-    until(lambda: [served.service.step(0.0), select.select(link, [], [], 0)[0]][1])
+    until(lambda: served.service.step(0.0) or select.select(link, [], [], 0)[0])
 
 
 @pytest.mark.parametrize("stalled", ["loop", "gateway", "both"])
@@ -308,7 +311,7 @@ def test_a_repeated_late_command_is_executed_unless_another_one_was_meanwhile(
             served.link.fence()
         elif meanwhile:
             other = Asking(context, served, addresses[1], meanwhile)
-            until(lambda: [served.serve(aged), pass_time(clock, 1e-3), other.socket.poll(0)][2])
+            served.serve_until(aged, lambda: pass_time(clock, 1e-3) or other.socket.poll(0))
         # Wait until the gateway can distinguish new requests from requests before the stop.
         until(lambda: served._is_open())
         count = len(aged.ages)
@@ -343,26 +346,25 @@ def test_a_fence_is_passed_only_after_some_time_without_a_gap(context, addresses
         assert asking.told(aged)["ok"]
 
 
-def test_a_setpoint_only_replaces_one_with_the_same_or_fewer_fields(context, addresses):
-    with Served(commands=addresses[1]) as served:
-        stream = context.socket(zmq.DEALER)
-        stream.connect(addresses[1])
-        for name, numbers in (
-            (b"force", {"force": 8.0}),
-            (b"angle", {"angle": 0.1}),
-            (b"both", {"force": 5.0, "angle": 0.1, "key": "k"}),
-            (b"later", {"force": 4.0, "angle": 0.2}),
-        ):
-            stream.send_multipart([name, b"", msgpack.packb({"command": "hold", **numbers})])
-        until(lambda: [served.settle(1), len(served.link.asked) == 4][1])
-        reasons = {}
-        while len(reasons) < 4:
-            served.serve(echo)
-            while stream.poll(0):
-                name, _, reply = stream.recv_multipart()
-                reasons[name] = msgpack.unpackb(reply).get("reason")
-        superseded = dict.fromkeys((b"angle", b"both"), "superseded")
-        assert reasons == {b"force": None, b"later": None, **superseded}
+def test_a_setpoint_only_replaces_one_with_the_same_or_fewer_fields(context, served, addresses):
+    stream = context.socket(zmq.DEALER)
+    stream.connect(addresses[1])
+    for name, numbers in (
+        (b"force", {"force": 8.0}),
+        (b"angle", {"angle": 0.1}),
+        (b"both", {"force": 5.0, "angle": 0.1, "key": "k"}),
+        (b"later", {"force": 4.0, "angle": 0.2}),
+    ):
+        stream.send_multipart([name, b"", msgpack.packb({"command": "hold", **numbers})])
+    served.settle_until(lambda: len(served.link.asked) == 4)
+    reasons = {}
+    while len(reasons) < 4:
+        served.serve(echo)
+        while stream.poll(0):
+            name, _, reply = stream.recv_multipart()
+            reasons[name] = msgpack.unpackb(reply).get("reason")
+    superseded = dict.fromkeys((b"angle", b"both"), "superseded")
+    assert reasons == {b"force": None, b"later": None, **superseded}
 
 
 def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
@@ -383,8 +385,8 @@ def test_only_the_newest_waiting_setpoint_is_executed(context, addresses):
 
         # Let the gateway receive all setpoints before the loop continues.
         commands = served.service.commands
-        until(lambda: [served.settle(1), commands.count + len(served.link.asked) == 40][1])
-        until(lambda: [served.serve(heard), collected()][1])
+        served.settle_until(lambda: commands.count + len(served.link.asked) == 40)
+        served.serve_until(heard, collected)
         forces = [request["force"] for request in heard.requests]
         assert {19, 119} <= set(forces), "each connection's newest setpoint must be executed"
         assert len(forces) <= 2 * -(-40 // bounds.UNANSWERED_MAX), (
@@ -416,9 +418,9 @@ def test_long_requests_are_unpacked_over_several_ticks_and_a_stop_goes_first(con
         for _ in range(bounds.UNANSWERED_MAX):
             client.send(long)
         asked = served.link.asked
-        until(lambda: [served.settle(1), len(asked) == bounds.UNANSWERED_MAX][1])
+        served.settle_until(lambda: len(asked) == bounds.UNANSWERED_MAX)
         stopper.send(msgpack.packb({"command": "stop"}))
-        until(lambda: [served.settle(1), len(asked) == bounds.UNANSWERED_MAX + 1][1])
+        served.settle_until(lambda: len(asked) == bounds.UNANSWERED_MAX + 1)
         served.server.serve(heard)
         assert heard.commands() == ["stop"]
         assert len(asked) == bounds.UNANSWERED_MAX - -(-4096 // len(long))
@@ -461,23 +463,23 @@ def test_a_stop_goes_before_all_waiting_requests(context, addresses):
         flood = Flood(context, addresses[1], clients=4, each=40)
         heard = Heard()
         link, queue = served.link, served.service.commands
-        until(lambda: [served.settle(1), len(link.asked) + queue.count == 160][1])
+        served.settle_until(lambda: len(link.asked) + queue.count == 160)
         served.serve(heard)  # Let the gateway process only part of the requests.
         carried_out = len(heard.requests)
         assert carried_out > 0
         stopper = context.socket(zmq.DEALER)
         stopper.connect(addresses[1])
         stopper.send_multipart([b"", msgpack.packb({"command": "stop"})])
-        until(lambda: [served.settle(1), any(ask.urgent for ask in link.asked)][1])
+        served.settle_until(lambda: any(ask.urgent for ask in link.asked))
 
         def serve() -> None:
             pass_time(clock, 1e-3)
             served.serve(heard)
 
-        until(lambda: [serve(), stopper.poll(0)][1])
+        until(lambda: serve() or stopper.poll(0))
         # Each request before the stop receives a reply but is not executed.
         replies: list[dict[str, Any]] = []
-        until(lambda: [serve(), flood.collect(replies) == 160][1])
+        until(lambda: serve() or flood.collect(replies) == 160)
         assert heard.commands()[carried_out:] == ["stop"]
         assert sum(reply["ok"] for reply in replies) == carried_out
 
@@ -496,7 +498,7 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
             return served.link.refused == 40 and quiet.collect(kind) == 3
 
         until(all_answered)
-        until(lambda: [served.serve(echo), flood.collect(replies) == 60][1])
+        served.serve_until(echo, lambda: flood.collect(replies) == 60)
         assert sum(reply["ok"] for reply in replies) == 20
         assert {reply.get("error") for reply in replies if not reply["ok"]} == {
             "too many commands: expected at most 20 per second"
@@ -508,7 +510,7 @@ def test_a_client_that_exceeds_its_rate_is_refused_and_others_are_not(context, a
         last: list[dict[str, Any]] = []
         # The reply to the last request follows all replies to the flood.
         answer = {"ok": True, "heard": "move"}
-        until(lambda: [served.serve(echo), flood.collect(last), answer in last][2])
+        served.serve_until(echo, lambda: flood.collect(last) and answer in last)
 
 
 def test_flooding_clients_leave_room_for_others(context, addresses):
@@ -516,7 +518,7 @@ def test_flooding_clients_leave_room_for_others(context, addresses):
     with Served(commands=addresses[1], per_second=600.0) as served:
         flood = Flood(context, addresses[1], clients=4, each=500)
         # Let the requests fill the gateway's buffers.
-        until(lambda: [served.service.step(0.0), served.service.commands.refused > 10][1])
+        until(lambda: served.service.step(0.0) or served.service.commands.refused > 10)
         assert Asking(context, served, addresses[1], "grasp").told(heard)["ok"]
         assert flood.sockets
         assert len(heard.requests) < 1100, "the request waited for later requests"

@@ -47,7 +47,7 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
     clients = [
         Asking(context, served, addresses[1], "arm") for _ in range(2 * bounds.UNANSWERED_MAX)
     ]
-    until(lambda: served.settle() or served.service.commands.count == bounds.UNANSWERED_MAX)
+    served.settle_until(lambda: served.service.commands.count == bounds.UNANSWERED_MAX)
     clock.sleep_until(clock.now() + 2.0)  # The delay simulates a busy machine.
     served.settle()
     assert len(served.link.asked) == bounds.UNANSWERED_MAX
@@ -90,7 +90,7 @@ def test_unknown_topics_are_not_stored(served, context, addresses):
     for k in range(500):
         subscriber.subscribe(f"hand/{k}")
     subscriber.subscribe(EVENT)
-    until(lambda: served.settle() or served.publisher.wanted == bit(EVENT))
+    served.settle_until(lambda: served.publisher.wanted == bit(EVENT))
     assert served.service.stream._prefixes == {EVENT}
 
 
@@ -104,19 +104,19 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
     served.settle()
     reader = connect(context, zmq.SUB, addresses[0])
     reader.subscribe(EVENT)
-    until(lambda: [served.settle(), reader.poll(0)][1])
+    served.settle_until(lambda: reader.poll(0))
     reader.recv_multipart()
     for _ in range(20):
         other = connect(context, zmq.SUB, addresses[0])
         other.subscribe(STATE)
-        until(lambda: served.settle() or served.publisher.wanted & bit(STATE))
+        served.settle_until(lambda: served.publisher.wanted & bit(STATE))
         other.subscribe(EVENT)
         other.unsubscribe(STATE)
-        until(lambda: served.settle() or not served.publisher.wanted & bit(STATE))
+        served.settle_until(lambda: not served.publisher.wanted & bit(STATE))
         other.close()
     assert not reader.poll(0)
     clock.sleep_until(clock.now() + 2.0 * bounds.REPEAT_INTERVAL)
-    until(lambda: [served.settle(), reader.poll(0)][1])
+    served.settle_until(lambda: reader.poll(0))
     reader.recv_multipart()
     assert not reader.poll(50)
 
@@ -188,7 +188,7 @@ def test_requests_that_waited_for_a_restart_of_the_gateway_are_old(
 @pytest.mark.parametrize("prefix", [b"\xa7command\xa4", b"\xd9\x07command\xd9\x04"])
 def test_a_stop_is_urgent_in_each_format_of_short_strings(served, context, addresses, prefix):
     client = Asking(context, served, addresses[1], b"\x81" + prefix + b"stop")
-    until(lambda: served.settle() or served.link.asked)
+    served.settle_until(lambda: served.link.asked)
     assert served.link.asked[0].urgent
     client.socket.close(0)
 

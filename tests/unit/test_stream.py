@@ -30,7 +30,7 @@ def subscribe(context: zmq.Context[Any], address: str, topic: bytes = b"") -> zm
 
 def receive(socket: zmq.Socket[Any], served: Served | None = None) -> tuple[bytes, dict[str, Any]]:
     if served is not None:
-        until(lambda: [served.settle(), socket.poll(0)][1])
+        served.settle_until(lambda: socket.poll(0))
     assert socket.poll(60_000)
     topic, payload = socket.recv_multipart()
     return topic, msgpack.unpackb(payload)
@@ -88,7 +88,7 @@ def test_invalid_subscriptions_do_not_affect_others(context, addresses, served):
     for message in (b"", b"\x05", b"\x05hand/state", b"\x01hand/nothing", b"\x01hand/event"):
         other.send(message)
     served.publisher.event(1.0, 1.0, "info", "test", "all has come")
-    until(lambda: [served.settle(), other.poll(0)][1])
+    served.settle_until(lambda: other.poll(0))
     listener.close()
     until(lambda: not wanted(served))
     assert wanted(served, EVENT), "the other subscription must remain"

@@ -158,7 +158,7 @@ def test_a_stop_by_signal_precedes_waiting_commands_and_prevents_them_from_armin
         for _ in range(20):
             client.send(msgpack.packb({"command": "arm"}))
         queue = served.service.commands
-        until(lambda: [served.settle(1), len(served.link.asked) + queue.count == 20][1])
+        served.settle_until(lambda: len(served.link.asked) + queue.count == 20)
         daemon.loop.stop()
         told = []
 
@@ -173,7 +173,7 @@ def test_a_stop_by_signal_precedes_waiting_commands_and_prevents_them_from_armin
         until(lambda: tick() == 20)
         assert all("before the last stop" in reply["error"] for reply in told)
         client.send(msgpack.packb({"command": "arm"}))
-        until(lambda: [served.settle(1), served.link.asked][1])
+        served.settle_until(lambda: served.link.asked)
         daemon.loop.advance(daemon.loop.period)
         assert daemon.loop.state.mode == "armed"
 
