@@ -408,7 +408,7 @@ class MujocoHand(SimulatedHand):
     ) -> None:
         """Build the scene at rest. Raises SettingsError if the settings are not supported."""
         step = Options.model_validate(settings.plugins.tables.get("mujoco", {})).timestep
-        table = table or make_table(settings, make_material(settings.material))
+        table = table or make_table(settings)
         parameters = Parameters()
         set_parameters(parameters, settings, table, step)
         self.model = mujoco.MjModel.from_xml_string(hand_mjcf(settings, parameters))

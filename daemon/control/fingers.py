@@ -31,7 +31,7 @@ class Fingers:
 
     def __init__(self, settings: Settings, state: State, grasp: GraspState) -> None:
         """Create the fingers; ``state`` and ``grasp`` are read on each tick but never written."""
-        self.indices = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
+        self.indices = settings.scene.indices
         self.reading, self.pose, self.grasp = state.reading, state.object, grasp
         self._settings, self._contacts = settings, state.contacts
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time

@@ -23,7 +23,7 @@ from softfinger.daemon.loop.loop import Loop
 from softfinger.daemon.loop.warm_up import WantedScene, warm_up
 from softfinger.daemon.perception.finger_model import FingerModel
 from softfinger.daemon.perception.perception import Perception
-from softfinger.daemon.profile.factory import make_material, make_table
+from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
@@ -49,7 +49,7 @@ def make_hand(settings: Settings, t: float) -> SimulatedHand | None:
         return None
     from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
-    table = make_table(settings, make_material(settings.material))
+    table = make_table(settings)
     own = backend("servos", settings.servos.backend).hand
     made: SimulatedHand = (own if callable(own) else SimulatedHand)(settings, t, table)
     return made

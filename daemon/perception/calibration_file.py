@@ -170,7 +170,7 @@ def sensor_of(settings: Settings, finger: int) -> Sensor:
         label=tactile.sensor[finger] or _usb_serial(settings, finger),
         rows=tactile.rows,
         cols=tactile.cols,
-        pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
+        pitch=tactile.pitches,
         full_count=tactile.full_count,
     )
 

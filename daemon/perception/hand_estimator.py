@@ -44,7 +44,7 @@ from softfinger.daemon.perception.hand_state import HISTORY_TIME, LAW_POINTS, Ha
 from softfinger.daemon.perception.prior import Prior
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
-from softfinger.daemon.types import FINGERS, Contact, Frame, Goal, ObjectPose, Reading
+from softfinger.daemon.types import Contact, Frame, Goal, ObjectPose, Reading
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -74,7 +74,7 @@ class HandEstimator:
         stress-strain law. By default, the priors come from the settings.
         """
         hand, gear = settings.hand, settings.servos.gear_ratio
-        self._fingers = [FINGERS.index(finger) for finger in sorted(settings.scene.fingers)]
+        self._fingers = settings.scene.indices
         self._estimates_object = settings.scene.object_model
         self._tables = tables[0].data, tables[1].data
         self._state = state = HandFilter()

@@ -128,8 +128,7 @@ class FingerPerception:
         # Some recordings specify the count at which their cells saturated.
         full = getattr(sensor, "full_count", None)
         if full is not None and full < settings.tactile.full_count:
-            own = settings.tactile.model_copy(update={"full_count": full})
-            settings = settings.model_copy(update={"tactile": own})
+            settings = settings.changed(tactile={"full_count": full})
         for note in getattr(sensor, "notes", ()):
             events.append(("warning", "tactile", note))
         tactile, calibration = settings.tactile, model.calibration

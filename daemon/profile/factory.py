@@ -48,13 +48,13 @@ def make_material(law: MaterialSettings) -> Material:
 
 
 def make_table(
-    settings: Settings, material: Material, tip: Fingertip | None = None
+    settings: Settings, material: Material | None = None, tip: Fingertip | None = None
 ) -> ContactTable:
-    """Create the contact table for ``tip``, which defaults to the tip in the settings.
+    """Create the contact table for ``material`` and ``tip``, by default those in the settings.
 
     Raises SettingsError if the tolerance cannot be reached with this material.
     """
-    tip = tip or make_tip(settings)
+    material, tip = material or make_material(settings.material), tip or make_tip(settings)
     try:
         # Only tables of spring tips are cached. Other tables are fast to build.
         if tip.physics != "springs":
@@ -84,7 +84,7 @@ def make_grid(
     return SensorGrid(
         rows=tactile.rows,
         cols=tactile.cols,
-        pitch=(tactile.pitch, tactile.pitch_y or tactile.pitch),
+        pitch=tactile.pitches,
         centre=tactile.centre if centre is None else centre,
         rotation=tactile.rotation[finger] if rotation is None else rotation,
         blur=tactile.blur,

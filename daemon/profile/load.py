@@ -191,15 +191,10 @@ def profile_text(path: Path) -> str:
 
 def without_files(settings: Settings) -> Settings:
     """Remove all file paths from settings that were loaded from another user's file."""
-    changes = {
-        "tactile": {"calibration": ("", ""), "recording": ("", "")},
-        "control": {"envelope": ""},
-        "access": {"keys": ""},
-    }
-    return settings.model_copy(
-        update={
-            name: getattr(settings, name).model_copy(update=each) for name, each in changes.items()
-        }
+    return settings.changed(
+        tactile={"calibration": ("", ""), "recording": ("", "")},
+        control={"envelope": ""},
+        access={"keys": ""},
     )
 
 
@@ -329,6 +324,4 @@ def _with_directory(settings: Settings, directory: Path) -> Settings:
         port.replace("{dir}", str(directory))
         for port in (settings.servos.port, *settings.tactile.port)
     )
-    servos = settings.servos.model_copy(update={"port": servo})
-    tactile = settings.tactile.model_copy(update={"port": (left, right)})
-    return settings.model_copy(update={"servos": servos, "tactile": tactile})
+    return settings.changed(servos={"port": servo}, tactile={"port": (left, right)})

@@ -278,6 +278,11 @@ class TactileSettings(Section):
         True, "", 'With backend = "replay": repeat the recording when it ends.'
     )
 
+    @property
+    def pitches(self) -> tuple[float, float]:
+        """Distances between column centres and between row centres [m]."""
+        return self.pitch, self.pitch_y or self.pitch
+
 
 class EstimatorSettings(Section):
     """Estimation of displacement and tilt from a frame."""
@@ -635,6 +640,14 @@ class Settings(Section):
     simulation: SimulationSettings = SimulationSettings()
     task: TaskSettings = TaskSettings()
     plugins: PluginSettings = PluginSettings()
+
+    def changed(self, **sections: dict[str, Any]) -> Settings:
+        """Return a copy with the given values of each section; the values are not validated."""
+        return self.model_copy(
+            update={
+                name: getattr(self, name).model_copy(update=keys) for name, keys in sections.items()
+            }
+        )
 
     @property
     def simulated(self) -> bool:

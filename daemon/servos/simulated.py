@@ -14,7 +14,7 @@ from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.checks import check_model
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.joint import JointScale, current_toward
-from softfinger.daemon.types import FINGERS, Goal, Reading
+from softfinger.daemon.types import Goal, Reading
 
 _HEALTH_INTERVAL = 0.25  # time between temperature and supply voltage readings [s]
 _OVERLOAD_TIME = 2.0  # time at maximum current after which an overload error occurs [s]
@@ -54,7 +54,7 @@ class SimulatedServos:
         self._model = by_name(settings.servos.model)
         self._hand = hand
         self._clock = clock
-        self._joints = sorted(FINGERS.index(name) for name in settings.scene.fingers)
+        self._joints = settings.scene.indices
         self._scales = [JointScale.of(settings.servos, i, self._model) for i in range(2)]
         self._watchdog = settings.servos.watchdog or math.inf
         self._connected = False

@@ -22,19 +22,17 @@ _PITCH_TOLERANCE = 0.01
 def pitch_difference(recording: FrameRecording, pitch: tuple[float, float]) -> str:
     """Describe how the cell size in a file differs from ``pitch`` (x, y) [m].
 
-    If y is 0, the cells are assumed to be square. The text is empty if the cell sizes agree or if
-    the file does not state a cell size.
+    The text is empty if the cell sizes agree or if the file does not state a cell size.
     """
     if recording.pitch is None:
         return ""
-    wanted = pitch[0], pitch[1] or pitch[0]
-    pairs = zip(recording.pitch, wanted, strict=True)
+    pairs = zip(recording.pitch, pitch, strict=True)
     if all(abs(found / each - 1.0) < _PITCH_TOLERANCE for found, each in pairs):
         return ""
     x, y = (each * 1e3 for each in recording.pitch)
     return (
-        f"found cells of {x:.4g} × {y:.4g} mm in the header, expected {wanted[0] * 1e3:.4g} × "
-        f"{wanted[1] * 1e3:.4g} mm as in tactile.pitch: set tactile.pitch = {x * 1e-3:.6g}, "
+        f"found cells of {x:.4g} × {y:.4g} mm in the header, expected {pitch[0] * 1e3:.4g} × "
+        f"{pitch[1] * 1e3:.4g} mm as in tactile.pitch: set tactile.pitch = {x * 1e-3:.6g}, "
         f"tactile.pitch_y = {y * 1e-3:.6g}"
     )
 
@@ -104,7 +102,7 @@ class ReplayTactile:
                 f"{path}: found frames of {rows} × {cols} cells, expected {settings.rows} × "
                 f"{settings.cols}: set tactile.rows and tactile.cols"
             )
-        if wrong := pitch_difference(recording, (settings.pitch, settings.pitch_y)):
+        if wrong := pitch_difference(recording, settings.pitches):
             raise TactileError(f"{path}: {wrong}")
         self.notes = tuple(f"{path}: {note}" for note in recording.notes)
         self.full_count = recording.full_count

@@ -401,8 +401,7 @@ def _virtual(profile: Path | str | None, changes: Sequence[str]) -> Settings:
             f"{profile or 'changes'}: found hardware backends, expected simulated backends: use "
             "emulated_hand, which emulates the hardware"
         )
-    loop = settings.loop.model_copy(update={"clock": "virtual"})
-    return settings.model_copy(update={"loop": loop})
+    return settings.changed(loop={"clock": "virtual"})
 
 
 class RecordedHand(VirtualTimeHand):

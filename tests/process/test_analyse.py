@@ -78,8 +78,7 @@ def test_all_file_types_give_the_same_contacts(counts, tmp_path):
     for name in ("press.npz", "press.npy", "frames", "export.asf", "run.mcap"):
         # The export contains its own pitch, so a wrong pitch in the settings must have no effect.
         wrong = {"rows": 10, "cols": 10, "pitch": 0.002} if name == "export.asf" else {}
-        tactile = Settings().tactile.model_copy(update=wrong)
-        settings = Settings().model_copy(update={"tactile": tactile})
+        settings = Settings().changed(tactile=wrong)
         source = open_source(tmp_path / name, settings, own=name == "run.mcap")
         output = tmp_path / f"{name}.csv"
         write_csv(output, analyse(source, lambda done: None))
@@ -88,8 +87,8 @@ def test_all_file_types_give_the_same_contacts(counts, tmp_path):
 
 
 def test_a_recording_supplies_the_settings_of_its_material(counts, tmp_path):
-    law = Settings().material.model_copy(update={"law": "constant", "modulus": 1e6})
-    save_stream(tmp_path / "a.mcap", counts, Settings().model_copy(update={"material": law}))
+    settings = Settings().changed(material={"law": "constant", "modulus": 1e6})
+    save_stream(tmp_path / "a.mcap", counts, settings)
     own = analyse(open_source(tmp_path / "a.mcap", Settings(), own=True), lambda n: None)
     mine = analyse(open_source(tmp_path / "a.mcap", Settings(), own=False), lambda n: None)
     assert own[0].values["gain"][20] < 0.5 * mine[0].values["gain"][20]

@@ -31,8 +31,7 @@ from tests.harness.servos import RunningBus, backend_settings, connected
 def exchange(bus: RunningBus, rate: float = 500.0, **servos: Any) -> Finding:
     """Return the doctor's finding about the duration of a tick's bus exchange."""
     settings = backend_settings(bus.port, **servos)
-    loop = settings.loop.model_copy(update={"rate": rate})
-    settings = settings.model_copy(update={"loop": loop})
+    settings = settings.changed(loop={"rate": rate})
     (found,) = [each for each in devices.check_servos(settings) if each.subject == "exchange"]
     return found
 

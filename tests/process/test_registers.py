@@ -137,8 +137,7 @@ def test_factory_settings_of_every_model_pass_the_checks():
         mode = "current-based position" if model.senses_current else "position"
         small = {"current_max": min(1.2, model.stall_current)}
         settings = backend_settings("none", model=name, mode=mode)
-        safety = settings.safety.model_copy(update=small)
-        settings = settings.model_copy(update={"safety": safety})
+        settings = settings.changed(safety=small)
         table = ControlTable(model, model.firmware)
         table.set(reg.GOAL_PWM, 885)
         wrong = {

@@ -97,8 +97,7 @@ def test_cells_above_the_saturation_pressure_of_the_header_are_excluded(
     path.write_bytes(export(frames, unit, 1.0 / pascal, digits=digits, header=[line]))
     settings, within = SETTINGS, 3e-5
     if digits == 0:  # Rounding to whole kPa adds noise of 0.3 kPa.
-        tactile = SETTINGS.tactile.model_copy(update={"noise": 600.0})
-        settings, within = SETTINGS.model_copy(update={"tactile": tactile}), 6e-5
+        settings, within = SETTINGS.changed(tactile={"noise": 600.0}), 6e-5
     check(path, settings, within)
     assert not load_recording(path, SCALE, 100.0).notes
 
@@ -145,8 +144,7 @@ def test_raw_readings_saturate_at_255(press, tmp_path):
     assert np.count_nonzero(counts == 255) > 20
     path.write_bytes(export(counts, "RAW", 1.0, digits=0))
     assert load_recording(path, 60.0, 100.0).full_count == 255
-    tactile = SETTINGS.tactile.model_copy(update={"pascal_per_count": 60.0})
-    check(path, SETTINGS.model_copy(update={"tactile": tactile}))
+    check(path, SETTINGS.changed(tactile={"pascal_per_count": 60.0}))
 
 
 # Zero offsets and dead cells.

@@ -181,9 +181,7 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
     path = tmp_path / "held.npz"
     np.savez(path, frames=sensor.press(0.003, 0.15, frames=10))
     settings = daemon_settings(folder, path)
-    in_pascal = settings.model_copy(
-        update={"stream": settings.stream.model_copy(update={"tactile_unit": "Pa"})}
-    )
+    in_pascal = settings.changed(stream={"tactile_unit": "Pa"})
     calibration = load_calibration(folder / "sensor.json")
     for each in (settings, in_pascal):
         with Daemon(each, wire=False) as daemon:

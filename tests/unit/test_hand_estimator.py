@@ -9,7 +9,7 @@ from scipy.optimize import curve_fit
 
 from softfinger.daemon.perception.hand_estimator import HandEstimator
 from softfinger.daemon.perception.hand_state import ENCODER, STATES, HandFilter, correct
-from softfinger.daemon.profile.factory import make_material, make_table
+from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import VELOCITY_UNIT
 from softfinger.daemon.types import Contact, Frame, Goal, ObjectPose, Reading
@@ -86,7 +86,7 @@ def test_channel_consistency_is_one_for_modelled_noise_and_four_for_doubled_nois
 
 @pytest.fixture
 def estimator() -> HandEstimator:
-    table = make_table(SETTINGS, make_material(SETTINGS.material))
+    table = make_table(SETTINGS)
     return HandEstimator(SETTINGS, (table, table))
 
 
@@ -101,7 +101,7 @@ ESTIMATE = ContactEstimate(
 
 def test_systematic_errors_do_not_average_out():
     settings = Settings.model_validate({"scene": {"fingers": ("left",)}})
-    table = make_table(settings, make_material(settings.material))
+    table = make_table(settings)
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     shared = np.diag([2e-5**2, 4e-3**2, 0.0, 0.0])
@@ -283,7 +283,7 @@ def test_friction_is_measured_again_only_after_a_longer_gap(estimator, gap, kept
 @pytest.mark.parametrize("response", [0.04, 0.08])
 def test_joint_motion_compensates_for_slow_cells(response):
     settings = Settings.model_validate({"tactile": {"response": response}})
-    table = make_table(settings, make_material(settings.material))
+    table = make_table(settings)
     estimator = HandEstimator(settings, (table, table))
     contacts, pose = [Contact(), Contact()], ObjectPose()
     d, q = 0.003, 0.15

@@ -123,8 +123,7 @@ class Bus:
         self.t = port.t
 
     def provision(self, **servos: Any) -> tuple[list[str], list[str]]:
-        changed = self.settings.servos.model_copy(update=servos)
-        result = provision(self.settings.model_copy(update={"servos": changed}))
+        result = provision(self.settings.changed(servos=servos))
         done = [str(each) for each in result if each.status == "fixed"]
         return done, [str(each) for each in result if each.status == "warn"]
 

@@ -40,8 +40,7 @@ def little_memory() -> Iterator[None]:
 
 
 def envelope(path: Path) -> object:
-    control = Settings().control.model_copy(update={"envelope": str(path)})
-    return Envelope(Settings().model_copy(update={"control": control}))
+    return Envelope(Settings().changed(control={"envelope": str(path)}))
 
 
 READERS: dict[str, Callable[[Path], object]] = {

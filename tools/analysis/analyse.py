@@ -228,7 +228,7 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             "--config PROFILE, for example --config paper, or with --set"
         )
     count, rows, cols = recording.counts.shape
-    for note in (*recording.notes, pitch_difference(recording, (tactile.pitch, tactile.pitch_y))):
+    for note in (*recording.notes, pitch_difference(recording, tactile.pitches)):
         if note:
             to_stderr("analyse")(f"{path}: {note}")
     changes: dict[str, float] = {"rows": rows, "cols": cols}
@@ -239,7 +239,7 @@ def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
             f"{path}: found frames of {rows} × {cols} cells, expected {tactile.rows} × "
             f"{tactile.cols}: set tactile.rows, tactile.cols and tactile.pitch"
         )
-    settings = settings.model_copy(update={"tactile": tactile.model_copy(update=changes)})
+    settings = settings.changed(tactile=changes)
     for warning in sensor_warnings(settings):
         to_stderr("analyse")(f"{path}: {warning}")
 

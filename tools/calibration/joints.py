@@ -60,7 +60,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
         "servos": {name: list(getattr(servos, name)) for name in ("ids", "direction", "zero")},
         "hand": {name: list(getattr(settings.hand, name)) for name in ("q_min", "q_max")},
     }
-    scene = sorted(FINGERS.index(name) for name in settings.scene.fingers)
+    scene = settings.scene.indices
     ids = [servos.ids[finger] for finger in scene]
     radian = 2.0 * math.pi / reg.COUNTS_PER_TURN / servos.gear_ratio
     told = []
@@ -154,10 +154,7 @@ def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
         )
     found = read_recording(arguments.recording[0])
     law, finger = HeatLaw(), arguments.finger
-    own = settings.model_copy(
-        update={"servos": settings.servos.model_copy(update={"heat_rise": 0.0, "heat_time": 0.0})}
-    )
-    rise, time = set_law(law, own)
+    rise, time = set_law(law, settings.changed(servos={"heat_rise": 0.0, "heat_time": 0.0}))
     known = found[f"{finger}.temperature"] > 0.0
     fit = fit_heat(
         law, *(found[key][known] for key in ("t", f"{finger}.current", f"{finger}.temperature"))

@@ -232,9 +232,8 @@ def _unhurried(settings: Settings, paced: bool) -> Settings:
     """
     changes = {"priority": 0, "cpus": (), "spin": 0.0, "lock_memory": False}
     held = paced and settings.realtime.hold_latency
-    realtime = settings.realtime.model_copy(update={**changes, "hold_latency": held})
-    loop = settings.loop.model_copy(update={"clock": "real"})
-    return settings.model_copy(update={"realtime": realtime, "loop": loop})
+    realtime = {**changes, "hold_latency": held}
+    return settings.changed(realtime=realtime, loop={"clock": "real"})
 
 
 def _send(folder: Path, words: str) -> int:

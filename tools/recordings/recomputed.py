@@ -109,8 +109,7 @@ def _models(settings: Settings, calibrations: list[str]) -> tuple[FingerModel, F
                 path = Path(folder) / f"{FINGERS[finger]}.json"
                 path.write_text(text, encoding="utf-8")
                 files[finger] = str(path)
-        tactile = settings.tactile.model_copy(update={"calibration": (files[0], files[1])})
-        return make_models(settings.model_copy(update={"tactile": tactile}))
+        return make_models(settings.changed(tactile={"calibration": (files[0], files[1])}))
 
 
 def counts_of(

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.clock import Deadline
-from softfinger.daemon.profile.factory import make_material, make_table
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.folder import ControlPort, LinkFolder, find_ports
@@ -183,12 +182,11 @@ class Emulator:
             deadline = Deadline(self._links.path / Deadline.NAME, os.O_CREAT)
             self._closing.callback((self._links.path / Deadline.NAME).unlink)
             self.clock = EmulatorClock(deadline)
-            table = make_table(settings, make_material(settings.material))
-            self.hand = SimulatedHand(settings, 0.0, table)
+            self.hand = SimulatedHand(settings)
             if settings.servos.backend != "none":
                 self._add_servos(settings, baud, factory)
             if settings.tactile.backend != "none":
-                for finger in sorted(FINGERS.index(name) for name in settings.scene.fingers):
+                for finger in settings.scene.indices:
                     self._add_board(settings, finger)
         except BaseException:
             self.close()

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from softfinger.daemon.profile.factory import make_material, make_table
+from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import (
     CURRENT_BASED_POSITION_MODE,
@@ -219,7 +219,7 @@ class SimulatedHand:
             If the settings can't be simulated.
         """
         if table is None:
-            table = make_table(settings, make_material(settings.material))
+            table = make_table(settings)
         self.settings = settings
         self.table = table
         self.step = stiff_step(settings, table) if step is None else step
