@@ -129,12 +129,5 @@ def _plugin(kind: Kind, name: str) -> Backend:
 
 
 def servo_model(name: str) -> Any:
-    """Return the `ServoModel` called ``name``.
-
-    If the name is unknown, raises a KeyError that lists all model names.
-    """
-    table = import_module("softfinger.daemon.servos.control_table")
-    try:
-        return table.by_name(name)
-    except KeyError:
-        raise KeyError(", ".join(table.MODELS)) from None
+    """Return the `ServoModel` called ``name``. Raises KeyError like `control_table.by_name`."""
+    return import_module("softfinger.daemon.servos.control_table").by_name(name)

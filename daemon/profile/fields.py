@@ -86,9 +86,8 @@ def _servo_model(name: str) -> str:
     try:
         servo_model(name)
     except KeyError as error:
-        raise PydanticCustomError(
-            "servo_model", "one of {known}", {"known": error.args[0]}
-        ) from None
+        expected = str(error.args[0]).partition("expected ")[2]
+        raise PydanticCustomError("servo_model", "{expected}", {"expected": expected}) from None
     return name
 
 

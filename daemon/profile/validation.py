@@ -35,55 +35,40 @@ def plausibility_warnings(settings: Settings) -> list[str]:
 
     The warnings are reported by the commands ``run``, ``doctor`` and ``config check``.
     """
-    checks = _deep_grip, _strong_grip, _weak_approach
-    return sensor_warnings(settings) + [text for check in checks for text in check(settings)]
+    checks = sensor_warnings, _deep_grip, _strong_grip, _weak_approach
+    return [text for check in checks for text in check(settings)]
 
 
-def sensor_warnings(settings: Settings) -> list[str]:
-    """Return warnings about sensors whose size does not suit the tips, one per line."""
-    return [*_wide_sensor(settings), *_small_sensor(settings)]
-
-
-def _wide_sensor(settings: Settings) -> Iterator[str]:
-    tip = settings.tip
-    if (
-        settings.tactile.backend != "none"
-        and min(_sides(settings)) > _SENSOR_WIDTH_MAX * 2.0 * tip.radius
-    ):
-        yield (
-            f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)} for a tip with "
-            f"a diameter of {tip.radius * 2e3:.4g} mm: check these settings and tip.radius"
-        )
-
-
-def _small_sensor(settings: Settings) -> Iterator[str]:
-    """Compare the sensor size with the contact area of a tip.
+def sensor_warnings(settings: Settings) -> Iterator[str]:
+    """Yield warnings about sensors whose size does not suit the tips.
 
     A solid tip loads the sensor with its whole base. A spring tip loads only the footprint.
     """
-    tip, tactile = settings.tip, settings.tactile
+    radius, tactile = settings.tip.radius, settings.tactile
     if tactile.backend == "none":
         return
-    sides = zip(_sides(settings), tactile.centre, strict=True)
-    half = min(0.5 * side - abs(at) for side, at in sides)
-    reaches = []
-    if tip.physics == "solid":
-        reaches.append(("base", tip.radius))
-    else:
-        depths = [(f"{key} = {force:g} N", d) for key, force, d in _set_depths(settings)]
-        depths.append(
-            (f"safety.d_max = {settings.safety.d_max * 1e3:.3g} mm", settings.safety.d_max)
+    sides = _sides(settings)
+    size = " × ".join(f"{1e3 * side:.4g}" for side in sides)
+    if min(sides) > _SENSOR_WIDTH_MAX * 2.0 * radius:
+        yield (
+            f"tactile.rows, cols, pitch: found a sensor area of {size} mm for a tip with a "
+            f"diameter of {radius * 2e3:.4g} mm: check these settings and tip.radius"
         )
-        for key, depth in depths:
-            d = min(depth, tip.radius)
-            reaches.append((f"footprint at {key}", math.sqrt(d * (2.0 * tip.radius - d))))
-    for what, reach in reaches:
+    reaches = [("base", radius)]
+    if settings.tip.physics != "solid":
+        d_max = settings.safety.d_max
+        depths = [(f"{key} = {force:g} N", d) for key, force, d in _set_depths(settings)]
+        reaches = []
+        for key, depth in (*depths, (f"safety.d_max = {d_max * 1e3:.3g} mm", d_max)):
+            d = min(depth, radius)
+            reaches.append((f"footprint at {key}", math.sqrt(d * (2.0 * radius - d))))
+    half = min(0.5 * side - abs(at) for side, at in zip(sides, tactile.centre, strict=True))
+    for part, reach in reaches:
         if half < reach:
             yield (
-                f"tactile.rows, cols, pitch: found a sensor area of {_size(settings)}, but the "
-                f"tip's {what} is {reach * 2e3:.3g} mm wide with tip.radius = "
-                f"{tip.radius * 1e3:.3g} mm: the pressure outside the sensor is not measured; use "
-                "a larger sensor or a lower force"
+                f"tactile.rows, cols, pitch: found a sensor area of {size} mm, but the tip's "
+                f"{part} is {reach * 2e3:.3g} mm wide with tip.radius = {radius * 1e3:.3g} mm: the "
+                "pressure outside the sensor is not measured; use a larger sensor or a lower force"
             )
             return
 
@@ -166,12 +151,7 @@ def _set_depths(settings: Settings) -> Iterator[tuple[str, float, float]]:
 def _sides(settings: Settings) -> tuple[float, float]:
     """Return the width and the height of the sensor [m]."""
     tactile = settings.tactile
-    return tactile.cols * tactile.pitch, tactile.rows * (tactile.pitch_y or tactile.pitch)
-
-
-def _size(settings: Settings) -> str:
-    width, height = _sides(settings)
-    return f"{width * 1e3:.4g} × {height * 1e3:.4g} mm"
+    return tactile.cols * tactile.pitches[0], tactile.rows * tactile.pitches[1]
 
 
 def shown(value: Any) -> str:
@@ -186,18 +166,15 @@ def shown(value: Any) -> str:
         text = '"' + "".join(each if each.isprintable() else "?" for each in value) + '"'
     else:
         text = str(value)
-    return (
-        text if len(text) <= _VALUE_LENGTH_MAX else text[: _VALUE_LENGTH_MAX - 2] + "…" + text[-1]
-    )
+    if len(text) > _VALUE_LENGTH_MAX:
+        return text[: _VALUE_LENGTH_MAX - 2] + "…" + text[-1]
+    return text
 
 
-def _fingers(settings: Settings) -> Iterator[str]:
+def _scene(settings: Settings) -> Iterator[str]:
     fingers = settings.scene.fingers
     if len(set(fingers)) != len(fingers):
         yield f"scene.fingers: found {shown(fingers)}, expected each finger once"
-
-
-def _backends(settings: Settings) -> Iterator[str]:
     servos, tactile = settings.servos.backend, settings.tactile.backend
     both = f"servos.backend, tactile.backend: found {servos} and {tactile}"
     if servos == tactile == "none":
@@ -218,13 +195,20 @@ def _joints(settings: Settings) -> Iterator[str]:
 
 
 def _servos(settings: Settings) -> Iterator[str]:
-    servos = settings.servos
+    servos, period = settings.servos, 1.0 / settings.loop.rate
     if servos.ids[0] == servos.ids[1] and len(settings.scene.fingers) == 2:
         yield f"servos.ids: found {shown(servos.ids)}, expected two different IDs"
+    for key in ("watchdog", "fault_after"):
+        value = getattr(servos, key)
+        if 0.0 < value <= 2.0 * period:
+            yield (
+                f"servos.{key}: found {value:g} s, expected more than {2.0 * period:g} s, the "
+                "duration of two ticks"
+            )
 
 
 def _ports(settings: Settings) -> Iterator[str]:
-    """Check that each device has its own port. Plugin ports are not checked."""
+    """Check that each device has its own port. The ports of plugins may be equal."""
     taken: dict[str, str] = {}
     for key, port in settings.ports(plugins=False):
         place = os.path.realpath(port)
@@ -235,81 +219,9 @@ def _ports(settings: Settings) -> Iterator[str]:
                 "the boards have no serial numbers, use their names in /dev/serial/by-path"
             )
         taken.setdefault(place, key)
-
-
-def _timing(settings: Settings) -> Iterator[str]:
-    period = 1.0 / settings.loop.rate
-    for key in ("watchdog", "fault_after"):
-        value = getattr(settings.servos, key)
-        if 0.0 < value <= 2.0 * period:
-            yield (
-                f"servos.{key}: found {value:g} s, expected more than {2.0 * period:g} s, the "
-                "duration of two ticks"
-            )
-
-
-def _measured_tip(settings: Settings) -> Iterator[str]:
-    if settings.tip.physics != "measured":
-        return
-    backend = settings.tactile.backend
-    if backend in ("simulated", "none"):
-        yield (
-            f'tip.physics: found "measured" with tactile.backend = "{backend}", expected '
-            '"springs" or "solid": measured curves require the frames of a physical board'
-        )
-    else:
-        file = 'a file created by `softfinger calibrate law`, because tip.physics is "measured"'
-        yield from _missing(settings, "calibration", file)
-
-
-def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
-    """Check that a tactile setting contains a string for each finger in the scene."""
-    for name in settings.scene.fingers:
-        if not getattr(settings.tactile, key)[FINGERS.index(name)]:
-            yield f'tactile.{key}: found "" for {name}, expected {expected}'
-
-
-def _too_large(key: str, found: float, unit: str, limit: float, why: str) -> Iterator[str]:
-    if found > limit:
-        yield f"{key}: found {found:g} {unit}, expected at most {limit:g} {unit}, {why}"
-
-
-def _depth(settings: Settings) -> Iterator[str]:
-    """Check that the displacement limit does not exceed the tip radius."""
-    why = "the tip's radius"
-    yield from _too_large("safety.d_max", settings.safety.d_max, "m", settings.tip.radius, why)
-
-
-def _solid_tip(settings: Settings) -> Iterator[str]:
-    tip, tactile = settings.tip, settings.tactile
-    if tip.physics != "solid":
-        return
-    if settings.material.law != "constant":
-        yield f'material.law: found "{settings.material.law}", expected "constant" for a solid tip'
-    why = "0.4 times the radius of a solid tip"
-    yield from _too_large("safety.d_max", settings.safety.d_max, "m", 0.4 * tip.radius, why)
-    if tactile.backend == "none":
-        return
-    why = "a quarter of a solid tip's radius, because θ can't be measured with more blur"
-    blurred = list(_too_large("tactile.blur", tactile.blur, "m", 0.25 * tip.radius, why))
-    yield from blurred
-    if not [*blurred, *_blur(settings)]:
-        yield from _cells_under(settings)
-
-
-def _cells_under(settings: Settings) -> Iterator[str]:
-    """Check that the base of a solid tip covers enough cells."""
-    from softfinger.daemon.profile.factory import make_grid, make_tip
-    from softfinger.kinematics.estimation.error_budget import Uncertainty
-    from softfinger.kinematics.estimation.estimator import CELLS_MIN, cells_within_rim
-
-    known = Uncertainty(centre=settings.tactile.centre_error, pitch=settings.tactile.pitch_error)
-    cells = cells_within_rim(make_grid(settings), make_tip(settings), known).sum()
-    if cells < CELLS_MIN:
-        yield (
-            f"tactile.pitch, tactile.centre: found {cells} cells inside a solid tip's rim, "
-            f"expected at least {CELLS_MIN}"
-        )
+    for key, port in settings.ports():
+        if "{dir}" in port:
+            yield f"{key}: found {shown(port)}, but {{dir}} is not set; pass the folder with --dir"
 
 
 def _material(settings: Settings) -> Iterator[str]:
@@ -333,62 +245,85 @@ def _material(settings: Settings) -> Iterator[str]:
         yield f"material.strain, material.stress: {problem}"
 
 
-def _wedge(settings: Settings) -> Iterator[str]:
-    simulation = settings.simulation
-    if simulation.object_shape != "wedge":
+def _tip(settings: Settings) -> Iterator[str]:
+    tip, tactile, d_max = settings.tip, settings.tactile, settings.safety.d_max
+    yield from _too_large("safety.d_max", d_max, "m", tip.radius, "the tip's radius")
+    if tip.physics == "solid":
+        law = settings.material.law
+        if law != "constant":
+            yield f'material.law: found "{law}", expected "constant" for a solid tip'
+        why = "0.4 times the radius of a solid tip"
+        yield from _too_large("safety.d_max", d_max, "m", 0.4 * tip.radius, why)
+        if tactile.backend != "none":
+            yield from _solid_tip_sensor(settings)
+    elif tip.physics == "measured":
+        if tactile.backend in ("simulated", "none"):
+            yield (
+                f'tip.physics: found "measured" with tactile.backend = "{tactile.backend}", '
+                'expected "springs" or "solid": measured curves require the frames of a physical '
+                "board"
+            )
+        else:
+            file = 'a file created by `softfinger calibrate law`, because tip.physics is "measured"'
+            yield from _missing(settings, "calibration", file)
+
+
+def _too_large(key: str, found: float, unit: str, limit: float, why: str) -> Iterator[str]:
+    if found > limit:
+        yield f"{key}: found {found:g} {unit}, expected at most {limit:g} {unit}, {why}"
+
+
+def _missing(settings: Settings, key: str, expected: str) -> Iterator[str]:
+    """Check that a tactile setting contains a string for each finger in the scene."""
+    for name in settings.scene.fingers:
+        if not getattr(settings.tactile, key)[FINGERS.index(name)]:
+            yield f'tactile.{key}: found "" for {name}, expected {expected}'
+
+
+def _solid_tip_sensor(settings: Settings) -> Iterator[str]:
+    """Check the blur and the number of cells under the base of a solid tip."""
+    tactile, radius = settings.tactile, settings.tip.radius
+    why = "a quarter of a solid tip's radius, because θ can't be measured with more blur"
+    blurred = list(_too_large("tactile.blur", tactile.blur, "m", 0.25 * radius, why))
+    yield from blurred
+    if blurred or list(_blur(settings)):
         return
-    height, width = simulation.object_height, simulation.object_width
-    limit = 2.0 * math.atan(width / height)
-    if abs(simulation.object_taper) >= limit:
+    from softfinger.daemon.profile.factory import make_grid, make_tip
+    from softfinger.kinematics.estimation.error_budget import Uncertainty
+    from softfinger.kinematics.estimation.estimator import CELLS_MIN, cells_within_rim
+
+    known = Uncertainty(centre=tactile.centre_error, pitch=tactile.pitch_error)
+    cells = cells_within_rim(make_grid(settings), make_tip(settings), known).sum()
+    if cells < CELLS_MIN:
         yield (
-            f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
-            f"{limit:.3g} rad: at that angle, the faces of an object of this size would meet"
+            f"tactile.pitch, tactile.centre: found {cells} cells inside a solid tip's rim, "
+            f"expected at least {CELLS_MIN}"
         )
 
 
-def _dither(settings: Settings) -> Iterator[str]:
-    control = settings.control
-    if control.law != "upright":
-        return
-    limit = settings.safety.current_max * control.torque_constant
-    why = "the torque at safety.current_max"
-    yield from _too_large("control.dither_torque", control.dither_torque, "N·m", limit, why)
-    limit = settings.loop.rate / _DITHER_TICKS_MIN
-    why = f"which is {_DITHER_TICKS_MIN} ticks per period"
-    yield from _too_large("control.dither_frequency", control.dither_frequency, "Hz", limit, why)
+def _blur(settings: Settings) -> Iterator[str]:
+    limit, why = 0.5 * min(_sides(settings)), "half of the sensor's shorter side"
+    yield from _too_large("tactile.blur", settings.tactile.blur, "m", limit, why)
 
 
-def _cells(settings: Settings) -> Iterator[str]:
+def _tactile(settings: Settings) -> Iterator[str]:
     tactile = settings.tactile
-    for index, cells in enumerate(tactile.dead):
+    for name, cells in zip(FINGERS, tactile.dead, strict=True):
         for cell in cells:
             if cell[0] >= tactile.rows or cell[1] >= tactile.cols:
                 yield (
-                    f"tactile.dead: found {shown(cell)} for {FINGERS[index]}, expected a cell in "
+                    f"tactile.dead: found {shown(cell)} for {name}, expected a cell in "
                     f"the grid of {tactile.rows} × {tactile.cols} cells"
                 )
-
-
-def _blur(settings: Settings) -> Iterator[str]:
-    tactile = settings.tactile
-    limit = 0.5 * min(_sides(settings))
-    yield from _too_large(
-        "tactile.blur", tactile.blur, "m", limit, "half of the sensor's shorter side"
-    )
-
-
-def _recordings(settings: Settings) -> Iterator[str]:
-    if settings.tactile.backend == "replay":
+    yield from _blur(settings)
+    if tactile.backend == "replay":
         yield from _missing(settings, "recording", "the path of a recording")
 
 
-def _clock(settings: Settings) -> Iterator[str]:
+def _loop(settings: Settings) -> Iterator[str]:
     clock = settings.loop.clock
     if clock in ("hand", "virtual") and not settings.simulated:
         yield f'loop.clock: found {shown(clock)}, expected "auto" or "real" with hardware backends'
-
-
-def _limits(settings: Settings) -> Iterator[str]:
     safety = settings.safety
     if safety.frame_age_hold >= safety.frame_age_fault:
         yield (
@@ -397,8 +332,22 @@ def _limits(settings: Settings) -> Iterator[str]:
         )
 
 
-def _forces(settings: Settings) -> Iterator[str]:
-    low, high = settings.control.contact_force, GRIP_FRACTION * settings.safety.force_max
+def _control(settings: Settings) -> Iterator[str]:
+    control = settings.control
+    if control.law == "upright":
+        limit, why = (
+            settings.safety.current_max * control.torque_constant,
+            "the torque at safety.current_max",
+        )
+        yield from _too_large("control.dither_torque", control.dither_torque, "N·m", limit, why)
+        limit, why = (
+            settings.loop.rate / _DITHER_TICKS_MIN,
+            f"which is {_DITHER_TICKS_MIN} ticks per period",
+        )
+        yield from _too_large(
+            "control.dither_frequency", control.dither_frequency, "Hz", limit, why
+        )
+    low, high = control.contact_force, GRIP_FRACTION * settings.safety.force_max
     if low >= high:
         yield (
             f"control.contact_force: found {low:g} N, expected less than {GRIP_FRACTION:g} × "
@@ -408,6 +357,16 @@ def _forces(settings: Settings) -> Iterator[str]:
     for key, force in _set_forces(settings):
         if not low < force <= high:
             yield f"{key}: found {force:g} N, expected more than {low:g} N and at most {high:g} N"
+
+
+def _simulation(settings: Settings) -> Iterator[str]:
+    simulation = settings.simulation
+    limit = 2.0 * math.atan(simulation.object_width / simulation.object_height)
+    if simulation.object_shape == "wedge" and abs(simulation.object_taper) >= limit:
+        yield (
+            f"simulation.object_taper: found {simulation.object_taper:g} rad, expected less than "
+            f"{limit:.3g} rad: at that angle, the faces of an object of this size would meet"
+        )
 
 
 def address_problem(address: str, lacking: str) -> str:
@@ -442,31 +401,16 @@ def _addresses(settings: Settings) -> Iterator[str]:
             yield f"{key}: found {shown(address)}, expected an address other than {first}"
 
 
-def _folder(settings: Settings) -> Iterator[str]:
-    for key, port in settings.ports():
-        if "{dir}" in port:
-            yield f"{key}: found {shown(port)}, but {{dir}} is not set; pass the folder with --dir"
-
-
 _CHECKS = (
-    _fingers,
-    _backends,
+    _scene,
     _joints,
     _servos,
     _ports,
-    _timing,
     _material,
-    _depth,
-    _solid_tip,
-    _measured_tip,
-    _wedge,
-    _dither,
-    _cells,
-    _blur,
-    _recordings,
-    _clock,
-    _limits,
-    _forces,
+    _tip,
+    _tactile,
+    _loop,
+    _control,
+    _simulation,
     _addresses,
-    _folder,
 )

@@ -10,7 +10,7 @@ import pytest
 from softfinger.daemon.backends import BUILT_IN, Backend, known
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile import reference
-from softfinger.daemon.profile.factory import make_material, make_table
+from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.fields import Section, setting
 from softfinger.daemon.profile.load import load, names
 from softfinger.daemon.profile.settings import Settings
@@ -208,9 +208,9 @@ def test_all_contradictions_between_keys_are_reported(tmp_path):
         "hand.q_max",
         "hand.open_angle",
         "servos.ids",
+        "servos.port",
         "material.stress",
         "loop.clock",
-        "servos.port",
     ]
 
 
@@ -421,7 +421,7 @@ def test_forces_that_the_hand_does_not_have_are_warned_of(changes, told):
 @pytest.mark.parametrize("law", ["constant", "table_i"])
 def test_the_displacement_at_a_force_is_the_contact_tables(law):
     settings = load(changes=[f"material.law={law}"])
-    table = make_table(settings, make_material(settings.material))
+    table = make_table(settings)
     for force in (0.6, 5.0, 26.0):
         changes = [f"material.law={law}", f"control.force_default={force}"]
         ((_, _, d),) = _set_depths(load(changes=changes))
