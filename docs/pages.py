@@ -52,41 +52,6 @@ def _signed(value: float, form: str) -> str:
 # --- settings -------------------------------------------------------------------------------------
 
 
-_SETTINGS = """\
-# Settings
-
-A profile is a TOML file. It contains only the settings that differ from the defaults below, which
-describe the built-in simulated hand. To change a setting for one run, add an option such as
-`--set loop.rate=1000`. Units are SI unless stated otherwise, and pairs are [left, right]. A hand
-can have one or two fingers, and servos or sensors can be omitted.
-
-To check a profile without starting the daemon or accessing hardware, run
-`softfinger config check FILE`. The command prints all errors: unknown keys, wrong types, numbers
-out of range, contradictory keys, and calibration files that do not match the profile. It also warns
-about settings that are probably wrong, for example a sensor that is smaller than the footprint at
-the configured force, or a force that the servos cannot reach. The exit status is 1 if there are
-errors, and 0 if there are only warnings. `softfinger run` reports the same errors and warnings at
-startup.
-
-To print a section in the terminal, run `softfinger config reference SECTION`.
-
-With a JSON schema, editors can complete and check keys (Even Better TOML in VS Code, Taplo in other
-editors). The first line of each packaged profile refers to the schema file. To start your own
-profile, create the profile and the schema file:
-
-```sh
-softfinger config show hil > my.toml
-softfinger config schema > schema.json
-```
-
-## Profiles
-
-These profiles are installed with softfinger. Select one of them by name, for example
-`--config hil`. Select your own profile by its path.
-
-"""
-
-
 def configuration() -> str:
     """List all profile sections and keys from their declarations."""
     from softfinger.daemon.profile import reference
@@ -94,7 +59,7 @@ def configuration() -> str:
     from softfinger.tools.setup.config import subject
 
     profiles = ((f"`{name}`", subject(Path(name))) for name in names())
-    parts = [_SETTINGS, _table(("profile", "description"), profiles)]
+    parts = [_table(("profile", "description"), profiles)]
     heads = ("key", "default", "unit", "allowed", "meaning")
     keys = reference.every_key()
     for name, section in reference.sections().items():
@@ -120,31 +85,6 @@ def stream() -> str:
 # --- commands and subcommands ---------------------------------------------------------------------
 
 
-_COMMANDS = """\
-# Commands to the hand
-
-Send a command with `softfinger send`, with a method of [`Hand`](api.md), or as a msgpack map on a
-REQ socket ([the stream](stream.md#commands)). All three use the same names:
-
-```sh
-softfinger send grasp force=10N   # {"ok": true, "mode": "grasping"}
-```
-
-Numbers are in SI units. `softfinger send` also accepts units, as in `force=10N` and `angle=8deg`.
-
-Each command is accepted only in certain modes. Most commands need the lease. A client that sends
-such a command holds the lease for `commands.lease` seconds. During this time, commands from other
-clients are rejected if they need the lease.
-
-Every reply contains `ok`, and `mode` if the command was carried out. The reply to a rejected
-command contains `error`, a message for the user, and `reason`. Any command except `stop` can be
-rejected with the reasons `mode`, `lease`, `late`, `stopped`, `superseded`, `busy` and `request`
-([explanations](stream.md#commands)). The sections below list additional causes for each command.
-Numerical ranges are those of the built-in hand.
-
-"""
-
-
 def commands() -> str:
     """Describe all hand commands from the command table."""
     from softfinger.daemon.control.modes import COMMANDS, REPLY, Mode
@@ -162,7 +102,7 @@ def commands() -> str:
         leased = "no" if name in NO_LEASE_COMMANDS | {"stop"} else "yes"
         rows.append((f"[`{name}`](#{name})", given, where, leased))
     heads = ("command", "parameters", "accepted in the modes", "needs the lease")
-    parts = [_COMMANDS, _table(heads, rows)]
+    parts = [_table(heads, rows)]
     for name, each in COMMANDS.items():
         rows = []
         for key, parameter in each.parameters.items():
@@ -208,24 +148,6 @@ def _children(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
 # --- limits ---------------------------------------------------------------------------------------
 
 
-_LIMITS = """\
-# Limits
-
-The daemon checks these limits while a hand is running. The values are those of the built-in hand.
-To list the limits of your profile, run `softfinger limits --config FILE`.
-
-Each limit has one of three levels:
-
-- `warn`: the daemon reports the violation.
-- `limit`: the daemon restricts the goal.
-- `fault`: the daemon turns torque off until `clear`.
-
-The reaction time starts with the first reading or frame that exceeds the limit. If the setting of a
-limit is an age, add this age to the reaction time.
-
-"""
-
-
 def limits() -> str:
     """List all limits with quantity, level, reaction time and settings."""
     from softfinger.daemon.profile.settings import Settings
@@ -249,23 +171,10 @@ def limits() -> str:
         keys = ", ".join(_values(settings, row))
         rows.append((f"`{row.name}`", row.quantity, row.level, when, keys and f"`{keys}`"))
     heads = ("limit", "quantity", "level", "reaction time", "settings and defaults")
-    return _LIMITS + _table(heads, rows)
+    return _table(heads, rows)
 
 
 # --- events ---------------------------------------------------------------------------------------
-
-
-_EVENTS = """\
-# Events
-
-The daemon publishes events on the topic [`hand/event`](stream.md), and writes them to its log.
-`softfinger monitor` and `softfinger view` also show them. Each event has a level, a kind and a text
-with details. The table lists the cause and remedy of each kind.
-
-If the page [Limits](limits.md) lists the kind of an error with the level `fault`, the error turns
-torque off. Remove the cause of the error, then send `clear`.
-
-"""
 
 
 def events() -> str:
@@ -273,71 +182,7 @@ def events() -> str:
     from softfinger.daemon.wire.event_kinds import KINDS
 
     rows = ((f"`{kind}`", each.levels, each.cause, each.remedy) for kind, each in KINDS.items())
-    return _EVENTS + _table(("kind", "level", "cause", "what to do"), rows)
-
-
-# --- the interface for programs -------------------------------------------------------------------
-
-
-_API = """\
-# Python interface
-
-Import these names from `softfinger`. [Programs](programs.md) shows how to use them. Lengths are in
-m, forces in N, pressures in Pa, angles in rad and times in s, unless another unit is given.
-"""
-
-# Page sections: title, introduction and public names.
-_SECTIONS = (
-    (
-        "Control a hand",
-        "`AsyncHand` has the same methods as `Hand`. Commands and methods that wait are coroutines "
-        "and must be awaited.",
-        "Hand AsyncHand Subscription AsyncSubscription to_columns",
-    ),
-    (
-        "States, frames and events",
-        "`Hand` returns these records.",
-        "HandState FingerState ObjectState TactileFrame Event",
-    ),
-    (
-        "Other records of the stream",
-        "Most programs do not need these records. [The stream](stream.md) lists all topics and "
-        "their fields.",
-        "LoopStatistics Spread Rates HandSettings AnsweredCommand TickInput InputReading "
-        "InputFinger TrueState TrueFinger TrueObject",
-    ),
-    (
-        "Errors",
-        "All exceptions derive from `SoftfingerError`.",
-        "SoftfingerError Refused Reason NoAnswer NoStream NotInTime HandFault HandClosed "
-        "WrongThread SettingsError KeyFileError RecordingError TableError MaterialError",
-    ),
-    ("Recordings", "", "read_recording"),
-    (
-        "Contact model and estimator",
-        "These classes work without a daemon. For numbers they return numbers, and for arrays they "
-        "return arrays.",
-        "Fingertip Material ContactTable ContactForces Certificate SensorGrid ContactEstimator "
-        "ContactEstimate Invalid Readings Uncertainty",
-    ),
-    (
-        "Test kit",
-        "[Test your own controller](test-your-controller.md) shows how to use these classes. "
-        "Import them from `softfinger.testing`.",
-        "testing.virtual.VirtualHand testing.virtual.RecordedHand testing.emulated.EmulatedHand "
-        "testing.emulated.EmulatedBus",
-    ),
-    ("Checks for plugin authors", "", "testing.checks"),
-)
-
-
-def api() -> str:
-    """List the package's public names with their docstrings."""
-    parts = [_API]
-    for title, introduction, names in _SECTIONS:
-        parts.append(f"\n## {title}\n\n{introduction}\n")
-        parts += [f"\n::: softfinger.{name}\n" for name in names.split()]
-    return "".join(parts)
+    return _table(("kind", "level", "cause", "what to do"), rows)
 
 
 # --- tables within pages --------------------------------------------------------------------------
@@ -450,7 +295,7 @@ _FORCE, _WIDTH = 10.0, 0.040  # grip force [N] and object width [m] on the pages
 
 def upright_grips() -> str:
     """Tabulate displacement, joint angle, upright spring and residual angle φ/φ0 of a grip."""
-    from softfinger.daemon.profile.factory import make_material, make_table
+    from softfinger.daemon.profile.factory import make_table
     from softfinger.daemon.profile.settings import Settings
     from softfinger.kinematics.hand.upright import upright_spring
 
@@ -461,7 +306,7 @@ def upright_grips() -> str:
         ("constant E, 0.304 MPa", constant),
     ):
         settings = Settings.model_validate(sections)
-        table = make_table(settings, make_material(settings.material))
+        table = make_table(settings)
         hand, tip = settings.hand, settings.tip.radius
         low, high = 0.0, 0.01
         while high - low > 1e-9:
@@ -713,6 +558,10 @@ def recorded_grasp() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
+    "configuration": configuration,
+    "commands": commands,
+    "limits": limits,
+    "events": events,
     "recorded_grasp": recorded_grasp,
     "published": published,
     "checkpoints": checkpoints,
@@ -741,13 +590,8 @@ PAGES: dict[str, Callable[[], str]] = {
     "contributing.md": _from("CONTRIBUTING.md"),
     "changelog.md": _from("CHANGELOG.md"),
     "example.md": _program("tools/examples/grasp_and_turn.py"),
-    "configuration.md": configuration,
     "stream.md": stream,
-    "commands.md": commands,
     "command-line.md": command_line,
-    "limits.md": limits,
-    "events.md": events,
-    "api.md": api,
 }
 # Links to these project files are replaced with links to documentation pages.
 _LINKS = {
