@@ -36,33 +36,6 @@ _WORD = re.compile(r"\w+")
 _MESSAGE_START = re.compile(r"\w+ should (be |have )?")  # start of pydantic's messages
 
 
-class ExaminedProfile(NamedTuple):
-    """Profile with its errors.
-
-    Attributes
-    ----------
-    name
-        Name of the profile.
-    settings
-        The settings, with defaults for the keys in ``unused``.
-    errors
-        One line for every unknown key, wrong type and violated bound, and for every contradiction
-        between the other keys.
-    unused
-        Names of the keys and sections whose values cannot be used.
-    """
-
-    name: str
-    settings: Settings
-    errors: list[str]
-    unused: set[str]
-
-    def warnings(self) -> list[str]:
-        """Return one line for each setting that is allowed but probably wrong."""
-        found = _without_words(plausibility_warnings(self.settings), self.unused)
-        return [f"{self.name}: {line}" for line in found]
-
-
 def load(
     path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
 ) -> Settings:
@@ -80,22 +53,23 @@ def load(
     Raises
     ------
     SettingsError
-        One line for each error of `ExaminedProfile`, at most 20.
+        One line for each error found by `examine`, at most 20.
     """
-    return _without_errors(examine(path, directory, changes))
+    return _without_errors(_profile(path, directory, changes))
 
 
 def examine(
     path: Path | None = None, directory: Path | None = None, changes: Sequence[str] = ()
-) -> ExaminedProfile:
-    """Read a profile and find all of its errors. Raises SettingsError if the profile can't be read.
+) -> tuple[Settings, list[str], list[str]]:
+    """Return a profile's settings, its errors, and warnings about settings that are probably wrong.
 
-    The arguments are the same as for `load`.
+    An error is an unknown key, a wrong type, a violated bound or a contradiction between other
+    keys. Settings whose values cannot be used have their defaults. The arguments are the same as
+    for `load`. Raises SettingsError if the profile can't be read.
     """
-    name = str(path) if path else "built-in settings"
-    data = _read(find(path), name) if path else {}
-    changed = {_change(data, change) for change in changes}
-    return _examined(data, name, changed, directory)
+    found = _profile(path, directory, changes)
+    warnings = _without_words(plausibility_warnings(found.settings), found.unused)
+    return found.settings, found.errors, [f"{found.name}: {line}" for line in warnings]
 
 
 def checked(data: dict[str, Any]) -> Settings:
@@ -103,7 +77,21 @@ def checked(data: dict[str, Any]) -> Settings:
     return _without_errors(_examined(data, "settings"))
 
 
-def _without_errors(found: ExaminedProfile) -> Settings:
+class _Examined(NamedTuple):
+    name: str  # name of the profile
+    settings: Settings
+    errors: list[str]
+    unused: set[str]  # names of the keys and sections whose values cannot be used
+
+
+def _profile(path: Path | None, directory: Path | None, changes: Sequence[str]) -> _Examined:
+    name = str(path) if path else "built-in settings"
+    data = _read(find(path), name) if path else {}
+    changed = {_change(data, change) for change in changes}
+    return _examined(data, name, changed, directory)
+
+
+def _without_errors(found: _Examined) -> Settings:
     lines, more = found.errors[:_ERROR_COUNT_MAX], len(found.errors) - _ERROR_COUNT_MAX
     if more > 0:
         lines.append(f"{found.name}: {more} more errors")
@@ -117,7 +105,7 @@ def _examined(
     name: str,
     changed: Collection[str] = (),
     directory: Path | None = None,
-) -> ExaminedProfile:
+) -> _Examined:
     unused: set[str] = set()
     found: list[str] = []
     try:
@@ -136,7 +124,7 @@ def _examined(
         keys = re.split("[:(]", problem)[0].strip().split(", ")
         is_set = any(f"{key}.".startswith(f"{each}.") for key in keys for each in changed)
         errors.append(f"{'--set' if is_set else name}: {problem}")
-    return ExaminedProfile(name, settings, errors, unused)
+    return _Examined(name, settings, errors, unused)
 
 
 def _without_words(lines: Iterable[str], words: set[str]) -> list[str]:

@@ -76,10 +76,10 @@ def _check(arguments: argparse.Namespace) -> int:
 
     name, errors, warnings = str(arguments.config), list[str](), list[str]()
     try:
-        found = examine(arguments.config, arguments.dir or own_runtime_folder(), arguments.set)
-        errors, warnings = found.errors, found.warnings()
+        folder = arguments.dir or own_runtime_folder()
+        settings, errors, warnings = examine(arguments.config, folder, arguments.set)
         if not errors:
-            make_models(found.settings)
+            make_models(settings)
     except (SoftfingerError, ValueError) as error:
         errors += str(error).splitlines()
     for kind, lines in (("error", errors), ("warning", warnings)):
