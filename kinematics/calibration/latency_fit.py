@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.calibration.calibration import CalibrationError
-from softfinger.kinematics.calibration.friction_fit import DURATION_MAX, duration_error
+from softfinger.kinematics.calibration.servo_fit import time_grid
 
 FloatArray = NDArray[np.float64]
 
@@ -76,9 +76,7 @@ def fit_latency(
     read, closed = (np.asarray(each, np.float64) for each in joints)
     if t.size < _FRAME_COUNT_MIN or read.size < 2:
         raise CalibrationError(_too_little(0.0))
-    if read[-1] - read[0] > DURATION_MAX:
-        raise CalibrationError(duration_error(read[-1] - read[0]))
-    grid = np.arange(read[0], read[-1], _STEP)
+    grid = time_grid(read, _STEP)
     closing = np.interp(grid, read, closed - closed[0])
     rate = _rate(closing)
     ramps, widest = _ramps(t, grid, closing, rate)

@@ -9,8 +9,8 @@ import pytest
 
 from softfinger.daemon.profile.load import load
 from softfinger.kinematics.calibration.calibration import CalibrationError
-from softfinger.kinematics.calibration.friction_fit import fit_friction
 from softfinger.kinematics.calibration.latency_fit import fit_latency
+from softfinger.kinematics.calibration.servo_fit import fit_friction
 from softfinger.tools.calibration.friction import _way
 from softfinger.tools.cli import main
 from tests.harness.recorded_hand import record_hand

@@ -14,7 +14,7 @@ from softfinger.daemon.safety.heat import set_law
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.kinematics.calibration.calibration import CalibrationError
-from softfinger.kinematics.calibration.heat_fit import fit_heat
+from softfinger.kinematics.calibration.servo_fit import fit_heat
 from softfinger.kinematics.hand.servo_heat import (
     TIME_MAX,
     HeatState,

@@ -16,7 +16,7 @@ from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import STATE, HandState
 from softfinger.kinematics.calibration.calibration import CalibrationError
-from softfinger.kinematics.calibration.friction_fit import FrictionFit, fit_friction
+from softfinger.kinematics.calibration.servo_fit import FrictionFit, fit_friction
 from softfinger.tools.calibration.calibration_frames import bring
 from softfinger.tools.calibration.joints import write_keys
 from softfinger.tools.calibration.live_hand import LiveHand

@@ -24,7 +24,7 @@ from softfinger.daemon.servos.checks import DRIVE_REVERSE, Registers
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.calibration.calibration import CalibrationError
-from softfinger.kinematics.calibration.heat_fit import fit_heat
+from softfinger.kinematics.calibration.servo_fit import fit_heat
 from softfinger.kinematics.compiled.own_folder import write_whole
 from softfinger.kinematics.hand.servo_heat import HeatLaw
 from softfinger.tools.arguments import own_runtime_folder
