@@ -249,7 +249,7 @@ def test_impossible_steps_are_reported_and_change_nothing(bench, capsys, words, 
 @pytest.mark.parametrize("command", ["true {d.mm}", "true {d[0]}", "true {x}", "true {d", "true '"])
 def test_an_invalid_move_command_is_reported(command):
     with pytest.raises(CalibrationError, match=f"^--move: {re.escape(command)}: "):
-        calibration_frames.bring(SimpleNamespace(move=command), "apply load 1", {"load": 1})
+        calibration_frames.bring(SimpleNamespace(move=command), "apply load 1", load=1)
 
 
 def test_a_gain_that_no_grip_has_measured_is_refused(tmp_path, capsys, monkeypatch):

@@ -11,7 +11,7 @@ from softfinger.daemon.profile.load import load
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.calibration.latency_fit import fit_latency
 from softfinger.kinematics.calibration.servo_fit import fit_friction
-from softfinger.tools.calibration.friction import _way
+from softfinger.tools.calibration.motion import _way
 from softfinger.tools.cli import main
 from tests.harness.recorded_hand import record_hand
 

@@ -168,9 +168,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _calibrate_profile(arguments: argparse.Namespace, settings: Settings) -> str:
-    from softfinger.tools.calibration.friction import calibrate_friction
     from softfinger.tools.calibration.joints import calibrate_heat, calibrate_joints
-    from softfinger.tools.calibration.latency import calibrate_latency
+    from softfinger.tools.calibration.motion import calibrate_friction, calibrate_latency
 
     steps = {
         "joints": calibrate_joints,

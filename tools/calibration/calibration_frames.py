@@ -138,7 +138,7 @@ def _live(
                 if arguments.step == "relaxation":
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
-                bring(arguments, told, {"load": k + 1, **load})
+                bring(arguments, told, load=k + 1, **load)
             frames = _fresh(backend, clock)
             loads.append([next(frames) for _ in range(arguments.frames)])
     counts = [np.stack([frame.data for frame in load]) for load in loads]
@@ -156,29 +156,27 @@ def _while_pressed(
     before: deque[Frame] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock)
     with ThreadPoolExecutor(1) as pool:
-        brought = pool.submit(bring, arguments, told, {"load": 1, **load})
+        brought = pool.submit(bring, arguments, told, load=1, **load)
         while not brought.done():
             before.append(next(frames))
         brought.result()
     return [*before, *(next(frames) for _ in range(arguments.frames))]
 
 
-def bring(arguments: argparse.Namespace, told: str, load: Mapping[str, float | str]) -> None:
-    """Print an instruction, then wait for Enter or run ``--move``. Raises CalibrationError."""
-    print(told if arguments.move else f"{told}; then press Enter", file=sys.stderr, flush=True)
-    if arguments.move:
-        _move(arguments.move, load)
-    elif not sys.stdin.readline():
-        raise CalibrationError("the input ended before all loads were applied")
+def bring(arguments: argparse.Namespace, told: str, **load: float | str) -> None:
+    """Print an instruction, then wait for Enter, or until the ``--move`` program exits.
 
-
-def _move(command: str, load: Mapping[str, float | str]) -> None:
-    """Run the ``--move`` program for one load, and wait until it exits. Raises CalibrationError."""
+    ``load`` contains the values that replace the words in braces. Raises CalibrationError.
+    """
+    command = arguments.move
+    print(told if command else f"{told}; then press Enter", file=sys.stderr, flush=True)
+    if not command:
+        if not sys.stdin.readline():
+            raise CalibrationError("the input ended before all loads were applied")
+        return
     try:
-        words = [
-            word.format(**{"force": 0.0, "d": 0.0, "theta": 0.0, **load})
-            for word in shlex.split(command)
-        ]
+        values = {"force": 0.0, "d": 0.0, "theta": 0.0, **load}
+        words = [word.format(**values) for word in shlex.split(command)]
         done = subprocess.run(words, stdin=subprocess.DEVNULL, timeout=_WAIT).returncode
     except (
         LookupError,

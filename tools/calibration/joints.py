@@ -70,7 +70,7 @@ def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
             name = FINGERS[finger]
             at = {}
             for pose, wanted in _POSES.items():
-                bring(arguments, f"{name} finger: {wanted}", {"finger": name, "pose": pose})
+                bring(arguments, f"{name} finger: {wanted}", finger=name, pose=pose)
                 at[pose] = _read(line, ids)
             servo = _turned(name, at, radian)
             closed, opened, zero = (at[pose][servo] for pose in _POSES)
