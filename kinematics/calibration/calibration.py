@@ -1,22 +1,21 @@
-"""Calibrate a pressure sensor under a soft tip.
+"""Calibrate a pressure sensor under a soft tip, and the relaxation of the tip.
 
 The steps are, in order:
 
 1. tare: zero offset and noise of each cell without a load,
 2. equilibration: gains that equalise the response of all cells,
 3. curve: conversion from equilibrated readings to pressure,
-4. centre: position of the tip on the sensor and rotation of the sensor,
-5. modulus: modulus of the tip,
-6. relaxation: decrease in tip force during a hold.
+4. relaxation: decrease in tip force during a hold.
 
-Each step returns its result together with the residuals.
+`press_fit` determines the model and the position of the tip. Each step returns its result together
+with the residuals.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,18 +23,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softfinger import SoftfingerError
-from softfinger.kinematics.calibration.press_fit import (
-    Presses,
-    Trend,
-    depth_of_force,
-    fit_place,
-    golden_section,
-    trend,
-)
-from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.table import ContactTable
-from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 FloatArray = NDArray[np.float64]
 Kind = Literal["power", "cubic"]
@@ -46,14 +33,12 @@ _UNREST_SIGMA = 8.0  # A cell is unsteady if its noise exceeds this multiple of 
 # A tare fails if at least this many cells are unsteady. A smaller number of unsteady cells may be
 # due to faulty cells.
 _UNREST_CELL_COUNT = 4
-_TILT_MIN = math.radians(3.0)  # minimum range of tilts from which the rotation is determined
-_UPRIGHT_ERROR = math.radians(0.5)
-_PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, as a multiple of the noise
 _LAG_MAX = 8  # maximum lag of the noise correlation, in cells
 _SIGNIFICANT_SIGMA = 4.0  # A result is significant if it exceeds this number of standard errors.
 # If a zero offset exceeds this number of noise standard deviations, clipping at 0 is negligible.
 _CLIPPED_SIGMA = 4.0
 _HOLD_RATIO_MIN = 2.0  # minimum hold time, as a multiple of the longest time constant
+_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 _ITERATIONS = 25  # number of iterations that alternate between F∞ and the strengths
 
 
@@ -85,7 +70,7 @@ def tare(frames: ArrayLike) -> Tare:
     Raises CalibrationError if several cells vary much more than the other cells, which indicates a
     contact.
     """
-    stack = _stack(frames, "tare")
+    stack = stack_of(frames, "tare")
     if len(stack) < 2:
         raise CalibrationError("tare: found one frame, expected at least two")
     noise = stack.std(axis=0, ddof=1)
@@ -175,7 +160,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     """
     if not loads:
         raise CalibrationError("equilibrate: expected at least one uniform pressure")
-    readings = np.stack([_stack(load, "equilibrate").mean(axis=0) - zero for load in loads])
+    readings = np.stack([stack_of(load, "equilibrate").mean(axis=0) - zero for load in loads])
     response = readings.sum(axis=0)
     typical = float(np.median(response))
     if not typical > 0.0:
@@ -194,7 +179,7 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
     relative = target[:, None]
     before = readings[:, active] / relative - 1.0
     after = readings[:, active] * gain[active] / relative - 1.0
-    return Equilibration(gain, _rms(before), _rms(after))
+    return Equilibration(gain, rms(before), rms(after))
 
 
 @dataclass(frozen=True)
@@ -238,7 +223,7 @@ def fit_curve(
     CalibrationError
         If there are too few forces, or if the curve decreases.
     """
-    x = _stack(readings, "curve")
+    x = stack_of(readings, "curve")
     x = x.reshape(len(x), -1)
     known = np.asarray(force, np.float64)
     if known.shape != (len(x),) or not (np.isfinite(known).all() and (known > 0.0).all()):
@@ -252,7 +237,7 @@ def fit_curve(
         coefficients, errors = _power(x, known, area, full)
     else:
         coefficients, errors = _cubic(x, known, area, full)
-    return SensorCurve(kind, coefficients, errors, _rms(errors))
+    return SensorCurve(kind, coefficients, errors, rms(errors))
 
 
 def _cubic(
@@ -300,6 +285,22 @@ def _power(
     return (exponent, factor / full**exponent, 0.0, 0.0), errors
 
 
+def golden_section(cost: Callable[[float], float], low: float, high: float, within: float) -> float:
+    """Minimise ``cost`` on [low, high] by golden-section search, to the tolerance ``within``."""
+    left, right = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
+    at_left, at_right = cost(left), cost(right)
+    while high - low > within:
+        if at_left < at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN_RATIO * (high - low)
+            at_left = cost(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN_RATIO * (high - low)
+            at_right = cost(right)
+    return 0.5 * (low + high)
+
+
 def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
     """Set mean readings [rows, cols] below 4 σ to 0; ``frames`` is the number of frames averaged.
 
@@ -332,111 +333,6 @@ def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> Float
         return np.where(counts < z[-1] * sigma, sigma * np.interp(near, ended, z), counts)
 
     return whole(means) - whole(zero)
-
-
-@dataclass(frozen=True)
-class Centre:
-    """Result of `fit_centre`: the tip centre in sensor axes [m] and the rotation [rad].
-
-    ``rotation`` is None if no press was tilted. ``residual`` [m] is the change in the centre during
-    the last iteration. ``std`` [m] is the standard deviation of each coordinate of the centre.
-    """
-
-    centre: tuple[float, float]
-    rotation: float | None
-    residual: float
-    std: float
-
-
-def fit_centre(
-    frames: ArrayLike,
-    theta: ArrayLike,
-    tip: Fingertip,
-    material: Material,
-    grid: SensorGrid,
-    noise: float,
-    active: NDArray[np.bool_] | None = None,
-) -> Centre:
-    """Determine the tip centre and sensor rotation from presses at known tilts ``theta`` [n] [rad].
-
-    The tilts are in the finger's plane. The fit uses all cells of the ``frames`` [n, rows, cols]
-    [Pa]. The modulus of a spring tip need not be known. Raises CalibrationError if a frame does not
-    show a contact, or if all tilts are equal but nonzero.
-    """
-    stack = _stack(frames, "centre")
-    s = np.sin(np.asarray(theta, np.float64))
-    if s.shape != (len(stack),):
-        raise CalibrationError("centre: expected a tilt for each press, 0 for an upright press")
-    tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
-    if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT_ERROR):
-        raise CalibrationError(
-            f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so tilt and "
-            "position can't be separated; use only upright presses, or add presses with a larger "
-            "tilt"
-        )
-    for k, frame in enumerate(stack):
-        if not frame.max() > _PRESSED_SIGMA * noise:
-            raise CalibrationError(f"centre: press {k + 1} did not produce a valid contact")
-    used = np.broadcast_to(True if active is None else active, stack.shape)
-    force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
-    presses = Presses(stack, depth_of_force(tip, material, force), np.arcsin(s), noise, used)
-    found, residual, std = fit_place(presses, tip, material, grid, tilted)
-    # Add the uncertainty of the upright orientation. An orientation error shifts the centroid by
-    # the product of moment arm and error.
-    lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
-    std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
-    return Centre(found.centre, found.rotation if tilted else None, residual, std)
-
-
-@dataclass(frozen=True)
-class Modulus:
-    """Result of `fit_modulus` for the model F(d − d₀, θ).
-
-    ``modulus`` is E [Pa], and ``offset`` is d₀ [m]. ``errors`` [n] are the relative force errors.
-    ``trend`` contains the value of E at each load.
-    """
-
-    modulus: float
-    offset: float
-    errors: FloatArray
-    residual: float
-    trend: Trend
-
-
-def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
-    """Fit the constant modulus of a tip and the zero offset of d to a compression run.
-
-    The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and ``force`` [N] have
-    shape [n]. ``force`` is measured by the sensor. Raises CalibrationError if there are too few
-    points, or if the force does not increase with d.
-    """
-    depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
-    if not depth.shape == tilt.shape == load.shape:
-        raise CalibrationError("modulus: expected one value of d and one force for each frame")
-    used = (depth > 0.0) & (load > 0.0)
-    if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
-        raise CalibrationError("modulus: expected at least three contact frames with different d")
-    depth, tilt, load = depth[used], tilt[used], load[used]
-    if not np.polyfit(depth, load, 1)[0] > 0.0:
-        raise CalibrationError("modulus: the force does not increase with d")
-    unit, offset, modulus = ContactTable.build(tip, Material.constant(1.0)), 0.0, 0.0
-    for _ in range(30):
-        c = unit(np.maximum(depth - offset, 1e-9), tilt)
-        columns = np.stack([c.force, -c.force_d], axis=1) / load[:, None]
-        modulus, shift = np.linalg.lstsq(columns, np.ones(len(load)), rcond=None)[0].tolist()
-        if not modulus > 0.0 or np.count_nonzero(depth > offset) < 3:
-            raise CalibrationError(
-                "modulus: the force does not increase with d as it does in a contact; check that "
-                "the tip touches the sensor"
-            )
-        step = float(np.clip(shift / modulus, -5e-4, 5e-4))
-        offset += step
-        if abs(step) < 1e-9:
-            break
-    fitted = modulus * unit(np.maximum(depth - offset, 1e-9), tilt).force
-    errors = fitted / load - 1.0
-    alone = trend(depth, modulus / (1.0 + errors), load, tip.physics)
-    return Modulus(modulus, offset, errors, _rms(errors), alone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -516,7 +412,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
                 strengths = np.zeros(len(told))
                 strengths[used[1:] - 1] = found[1:] / found[0]
                 model = columns[:, used] @ found
-                fits.append((_rms(model / load[held:] - 1.0), found[0], strengths, model))
+                fits.append((rms(model / load[held:] - 1.0), found[0], strengths, model))
         error, scale, strengths, model = min(fits, key=lambda fit: fit[0])
         passed = np.maximum(load, 0.0) / scale + strengths @ memory
         lasting[:held] = (passed / (1.0 + strengths.sum()))[:held]
@@ -525,7 +421,7 @@ def fit_relaxation(t: ArrayLike, force: ArrayLike, times: tuple[float, ...]) -> 
     return Relaxation(tuple(whole.tolist()), error, fits[0][0], np.append(load[:held], model))
 
 
-def _stack(frames: ArrayLike, step: str) -> FloatArray:
+def stack_of(frames: ArrayLike, step: str) -> FloatArray:
     stack = np.asarray(frames, np.float64)
     if stack.ndim != 3 or not len(stack):
         raise CalibrationError(f"{step}: found shape {stack.shape}, expected [n, rows, cols]")
@@ -534,5 +430,5 @@ def _stack(frames: ArrayLike, step: str) -> FloatArray:
     return stack
 
 
-def _rms(values: FloatArray) -> float:
+def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0

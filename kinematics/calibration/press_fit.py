@@ -1,18 +1,24 @@
-"""Fit a tip's physics, modulus and position to presses at known depths and tilts.
+"""Fit a tip's physics, modulus and position on the sensor to presses at known d and tilts.
 
-The tip's forward model is fitted to all cells of all frames by least squares.
+`compare_tips` and `fit_centre` fit the tip's forward model to all cells of all frames by least
+squares. `fit_modulus` uses only the forces.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from softfinger.kinematics.calibration.calibration import (
+    CalibrationError,
+    golden_section,
+    rms,
+    stack_of,
+)
 from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import POISSON, Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -25,7 +31,9 @@ _STEP = 1e-5  # step for numerical derivatives [m]
 _PLACE_STEP = 2e-4  # position step [m]; large, because rim cells gain or lose whole sample points
 _ROTATION_STEP = 1e-4  # rad
 _ROTATION_STARTS = 8  # number of initial rotations to try
-_GOLDEN_RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
+_TILT_MIN = math.radians(3.0)  # minimum range of tilts from which the rotation is determined
+_UPRIGHT_ERROR = math.radians(0.5)
+_PRESSED_SIGMA = 6.0  # minimum peak reading of a contact, as a multiple of the noise
 _POISSON_TOLERANCE = 4e-3  # tolerance of ν
 # Presses whose d [m] and θ [rad] differ by less than this count as repetitions.
 _REPEATED_D, _REPEATED_THETA = 5e-5, 0.009
@@ -210,22 +218,6 @@ def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
     return min((at(poisson) for poisson in (inner, *POISSON)), key=lambda fit: fit.chi2)
 
 
-def golden_section(cost: Callable[[float], float], low: float, high: float, within: float) -> float:
-    """Minimise ``cost`` on [low, high] by golden-section search, to the tolerance ``within``."""
-    left, right = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
-    at_left, at_right = cost(left), cost(right)
-    while high - low > within:
-        if at_left < at_right:
-            high, right, at_right = right, left, at_left
-            left = high - _GOLDEN_RATIO * (high - low)
-            at_left = cost(left)
-        else:
-            low, left, at_left = left, right, at_right
-            right = low + _GOLDEN_RATIO * (high - low)
-            at_right = cost(right)
-    return 0.5 * (low + high)
-
-
 def _with_errors(
     presses: Presses, fit: TipFit, grid: SensorGrid, active: NDArray[np.bool_]
 ) -> TipFit:
@@ -264,7 +256,115 @@ def _with_errors(
     )
 
 
-def fit_place(
+@dataclass(frozen=True)
+class Modulus:
+    """Result of `fit_modulus` for the model F(d − d₀, θ).
+
+    ``modulus`` is E [Pa], and ``offset`` is d₀ [m]. ``errors`` [n] are the relative force errors.
+    ``trend`` contains the value of E at each load.
+    """
+
+    modulus: float
+    offset: float
+    errors: FloatArray
+    residual: float
+    trend: Trend
+
+
+def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
+    """Fit the constant modulus of a tip and the zero offset of d to a compression run.
+
+    The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and ``force`` [N] have
+    shape [n]. ``force`` is measured by the sensor. Raises CalibrationError if there are too few
+    points, or if the force does not increase with d.
+    """
+    depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
+    if not depth.shape == tilt.shape == load.shape:
+        raise CalibrationError("modulus: expected one value of d and one force for each frame")
+    used = (depth > 0.0) & (load > 0.0)
+    if np.count_nonzero(used) < 3 or np.ptp(depth[used]) <= 0.0:
+        raise CalibrationError("modulus: expected at least three contact frames with different d")
+    depth, tilt, load = depth[used], tilt[used], load[used]
+    if not np.polyfit(depth, load, 1)[0] > 0.0:
+        raise CalibrationError("modulus: the force does not increase with d")
+    unit, offset, modulus = ContactTable.build(tip, Material.constant(1.0)), 0.0, 0.0
+    for _ in range(30):
+        c = unit(np.maximum(depth - offset, 1e-9), tilt)
+        columns = np.stack([c.force, -c.force_d], axis=1) / load[:, None]
+        modulus, shift = np.linalg.lstsq(columns, np.ones(len(load)), rcond=None)[0].tolist()
+        if not modulus > 0.0 or np.count_nonzero(depth > offset) < 3:
+            raise CalibrationError(
+                "modulus: the force does not increase with d as it does in a contact; check that "
+                "the tip touches the sensor"
+            )
+        step = float(np.clip(shift / modulus, -5e-4, 5e-4))
+        offset += step
+        if abs(step) < 1e-9:
+            break
+    fitted = modulus * unit(np.maximum(depth - offset, 1e-9), tilt).force
+    errors = fitted / load - 1.0
+    alone = trend(depth, modulus / (1.0 + errors), load, tip.physics)
+    return Modulus(modulus, offset, errors, rms(errors), alone)
+
+
+@dataclass(frozen=True)
+class Centre:
+    """Result of `fit_centre`: the tip centre in sensor axes [m] and the rotation [rad].
+
+    ``rotation`` is None if no press was tilted. ``residual`` [m] is the change in the centre during
+    the last iteration. ``std`` [m] is the standard deviation of each coordinate of the centre.
+    """
+
+    centre: tuple[float, float]
+    rotation: float | None
+    residual: float
+    std: float
+
+
+def fit_centre(
+    frames: ArrayLike,
+    theta: ArrayLike,
+    tip: Fingertip,
+    material: Material,
+    grid: SensorGrid,
+    noise: float,
+    active: NDArray[np.bool_] | None = None,
+) -> Centre:
+    """Determine the tip centre and sensor rotation from presses at known tilts ``theta`` [n] [rad].
+
+    The tilts are in the finger's plane. The fit uses all cells of the ``frames`` [n, rows, cols]
+    [Pa]. The modulus of a spring tip need not be known. Raises CalibrationError if a frame does not
+    show a contact, or if all tilts are equal but nonzero.
+    """
+    stack = stack_of(frames, "centre")
+    s = np.sin(np.asarray(theta, np.float64))
+    if s.shape != (len(stack),):
+        raise CalibrationError("centre: expected a tilt for each press, 0 for an upright press")
+    tilted = float(np.ptp(s)) > math.sin(_TILT_MIN)
+    if not tilted and float(np.abs(s).max()) > math.sin(_UPRIGHT_ERROR):
+        raise CalibrationError(
+            f"centre: the tilts differ by less than {math.degrees(_TILT_MIN):g}°, so tilt and "
+            "position can't be separated; use only upright presses, or add presses with a larger "
+            "tilt"
+        )
+    for k, frame in enumerate(stack):
+        if not frame.max() > _PRESSED_SIGMA * noise:
+            raise CalibrationError(f"centre: press {k + 1} did not produce a valid contact")
+    used = np.broadcast_to(True if active is None else active, stack.shape)
+    force = (stack * used).sum(axis=(1, 2)) * math.prod(grid.pitches)
+    d = np.linspace(0.0, 0.4 * tip.radius, 401)
+    depths = np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
+    presses = Presses(stack, depths, np.arcsin(s), noise, used)
+    placed, last_step, std = _fit_place(presses, tip, material, grid, tilted)
+    # Add the uncertainty of the upright orientation. An orientation error shifts the centroid by
+    # the product of moment arm and error.
+    lever = (0.5 if tip.physics == "solid" else 1.0) * tip.radius
+    std = math.hypot(std, lever * _UPRIGHT_ERROR / math.sqrt(3.0 * len(s)))
+    rotation = (placed.rotation + math.pi) % (2.0 * math.pi) - math.pi if tilted else None
+    return Centre(placed.centre, rotation, last_step, std)
+
+
+def _fit_place(
     presses: Presses, tip: Fingertip, material: Material, grid: SensorGrid, rotate: bool
 ) -> tuple[SensorGrid, float, float]:
     """Fit the tip centre and, if ``rotate`` is True, the sensor rotation.
@@ -313,11 +413,4 @@ def fit_place(
     variance = float(((readings - now) ** 2).mean())
     x = len(depths)
     std = math.sqrt(variance * float(np.linalg.inv(jacobian.T @ jacobian)[x, x]))
-    rotation = (grid.rotation + math.pi) % (2.0 * math.pi) - math.pi
-    return replace(grid, rotation=rotation), shift, std
-
-
-def depth_of_force(tip: Fingertip, material: Material, force: FloatArray) -> FloatArray:
-    """Look up the displacement d [m] of an upright tip at ``force`` [N] in its contact table."""
-    d = np.linspace(0.0, 0.4 * tip.radius, 401)
-    return np.interp(force, ContactTable.build(tip, material)(d, 0.0).force, d)
+    return grid, shift, std

@@ -10,11 +10,10 @@ from softfinger.kinematics.calibration.calibration import (
     CalibrationError,
     above_zero,
     equilibrate,
-    fit_centre,
     fit_curve,
-    fit_modulus,
     tare,
 )
+from softfinger.kinematics.calibration.press_fit import fit_centre, fit_modulus
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid

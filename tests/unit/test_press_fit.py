@@ -8,8 +8,12 @@ import pytest
 
 from softfinger import ContactTable, Fingertip, Material, SensorGrid
 from softfinger.daemon.perception.calibration_file import load_calibration
-from softfinger.kinematics.calibration.calibration import fit_centre, fit_modulus
-from softfinger.kinematics.calibration.press_fit import Presses, compare_tips
+from softfinger.kinematics.calibration.press_fit import (
+    Presses,
+    compare_tips,
+    fit_centre,
+    fit_modulus,
+)
 from softfinger.tools.cli import main
 
 GRID = SensorGrid(32, 32, 0.058 / 32)

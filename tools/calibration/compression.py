@@ -10,7 +10,6 @@ import csv
 import json
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +32,7 @@ from softfinger.kinematics.calibration.compression_fit import (
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.tools.calibration.calibration_plot import Panel, Points
+from softfinger.tools.calibration.steps import tip_name, tip_settings
 
 FloatArray = NDArray[np.float64]
 
@@ -42,6 +42,13 @@ class _Quantity(NamedTuple):
 
     words: set[str]
     units: dict[str, float]
+
+
+class _Test(NamedTuple):
+    """Test run, and the name by which messages refer to it."""
+
+    name: str
+    run: Run
 
 
 _QUANTITIES = {
@@ -127,13 +134,13 @@ def _columns(path: Path, header: list[str], below: list[str]) -> dict[str, tuple
                 f"column with {name}"
             )
         unit = match[2] or match[3] or (below[k].strip("[]()") if k < len(below) else "")
-        units = {each.replace("μ", "µ"): value for each, value in _QUANTITIES[name].units.items()}
-        if unit.replace("μ", "µ") not in units:
+        unit, units = unit.replace("μ", "µ"), _QUANTITIES[name].units
+        if unit not in units:
             raise CalibrationError(
                 f"{path}: {title!r}: found {f'the unit {unit!r}' if unit else 'no unit'}, expected "
                 f"one of {', '.join(units)}, as in {_EXAMPLE}"
             )
-        found[name] = k, units[unit.replace("μ", "µ")]
+        found[name] = k, units[unit]
     if not ({"displacement", "force"} <= set(found) or {"strain", "stress"} <= set(found)):
         raise CalibrationError(
             f"{path}: found the columns {', '.join(map(repr, header))}, expected {_EXAMPLE}"
@@ -146,14 +153,6 @@ def _is_number(cell: str) -> bool:
         return math.isfinite(float(cell.replace(",", ".")))
     except ValueError:
         return False
-
-
-@dataclass(frozen=True)
-class _Test:
-    """Test run, and the name by which messages refer to it."""
-
-    name: str
-    run: Run
 
 
 def fit_files(
@@ -241,9 +240,7 @@ def _force_law(
         offset=float(best.zeros[0, 0]),
         residual=math.hypot(best.std, misfit),
     )
-    wants: dict[str, Any] = {"physics": tip.physics}
-    if tip.physics == "solid":
-        wants |= {"base": best.tip.base, "face": best.tip.face, "poisson": tip.poisson}
+    wants = tip_settings(best.tip)
     lines = [
         _fit_line(best, deepest),
         *(_fit_line(fit, deepest) for fit in fits if fit is not best),
@@ -256,8 +253,12 @@ def _force_law(
         )
     lines += [_run_line(test, zeros) for test, zeros in zip(tests, best.zeros, strict=True)]
     lines.append(f"for the profile: {_profile_line(wants, step)}")
+    return _with_law(calibration, step, wants), "\n  ".join(lines), _panels(best, tests)
+
+
+def _with_law(calibration: Calibration, step: ModulusStep, wants: dict[str, Any]) -> Calibration:
     changed = {"modulus": step, "wants": wants, "scales": None, "date": now()}
-    return calibration.model_copy(update=changed), "\n  ".join(lines), _panels(best, tests)
+    return calibration.model_copy(update=changed)
 
 
 def _is_constant(fit: CompressionFit) -> bool:
@@ -265,11 +266,9 @@ def _is_constant(fit: CompressionFit) -> bool:
 
 
 def _name(fit: CompressionFit) -> str:
-    if fit.tip.physics == "solid":
-        return f"solid, {fit.tip.base}, {fit.tip.face}, ν {fit.tip.poisson:.3f}"
-    if len(fit.factors) > 1:
-        return "springs, E(d)"
-    return "springs, constant E" if fit.law.is_linear else f"springs, law {fit.law.name}"
+    if fit.tip.physics == "springs" and fit.law.is_linear:
+        return "springs, constant E" if _is_constant(fit) else "springs, E(d)"
+    return tip_name(fit.tip, fit.law)
 
 
 def _fit_line(fit: CompressionFit, deepest: float) -> str:
@@ -355,24 +354,21 @@ def _stress_strain(
         f"{len(strain) - (rows.stop - rows.start)} unloading rows were excluded\n"
         f"  for the profile: {_profile_line(wants, step)}"
     )
-    changed = {"modulus": step, "wants": wants, "scales": None, "date": now()}
     shown = Points("law", "strain", "stress [kPa]", x, y * 1e-3, material.stress(x) * 1e-3)
-    return calibration.model_copy(update=changed), line, (shown,)
+    return _with_law(calibration, step, wants), line, (shown,)
 
 
 def _thinned(strain: FloatArray, stress: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Average the points in each strain range, if there are at least 2 × `_BINS` points."""
     if len(strain) < 2 * _BINS:
         return strain, stress
-    edges = np.linspace(strain.min(), strain.max(), _BINS + 1)
-    which = np.clip(np.searchsorted(edges, strain, "right") - 1, 0, _BINS - 1)
-    counts = np.bincount(which, minlength=_BINS)
+    counts, _ = np.histogram(strain, _BINS)
     used = counts > 0
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(which, values, _BINS)[used] / counts[used])
-
-    return mean(strain), mean(stress)
+    x, y = (
+        np.histogram(strain, _BINS, weights=each)[0][used] / counts[used]
+        for each in (strain, stress)
+    )
+    return x, y
 
 
 def _check_beginning(strain: FloatArray, stress: FloatArray) -> None:

@@ -36,9 +36,7 @@ from softfinger.kinematics.calibration.calibration import (
     CalibrationError,
     above_zero,
     equilibrate,
-    fit_centre,
     fit_curve,
-    fit_modulus,
     fit_relaxation,
     tare,
     without_clipping,
@@ -50,6 +48,8 @@ from softfinger.kinematics.calibration.press_fit import (
     Trend,
     compare_tips,
     first_cycle,
+    fit_centre,
+    fit_modulus,
 )
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -309,10 +309,7 @@ def _law(step: Step) -> Done:
         )
     best, lines = fits[0], [_told(each) for each in fits]
     steps: dict[str, Any] = {"scales": None}
-    wants: dict[str, str | float] = {"physics": best.tip.physics}
-    if best.tip.physics == "solid":
-        wants |= {"base": best.tip.base, "face": best.tip.face}
-        wants["poisson"] = round(best.tip.poisson, 3)
+    wants = tip_settings(best.tip)
     if best.valid > 0.0:
         strain = [] if best.law.is_linear else np.linspace(0.05, 1.0, 20).tolist()
         stress = [float(best.material.stress(each)) for each in strain]
@@ -408,16 +405,25 @@ def _over_d(trend: Trend) -> str:
     return f"{told}: drifts by {trend.drift:+.0%} ± {trend.std:.1%}, so {trend.cause}"
 
 
-def _name(fit: TipFit) -> str:
-    if fit.tip.physics == "solid":
-        return f"solid, {fit.tip.base}, {fit.tip.face}, ν {fit.tip.poisson:.3f}"
-    return "springs" if fit.law.is_linear else f"springs, law {fit.law.name}"
+def tip_name(tip: Fingertip, law: Material) -> str:
+    """Return the name of a tip model in the summary lines."""
+    if tip.physics == "solid":
+        return f"solid, {tip.base}, {tip.face}, ν {tip.poisson:.3f}"
+    return "springs" if law.is_linear else f"springs, law {law.name}"
+
+
+def tip_settings(tip: Fingertip) -> dict[str, str | float]:
+    """Return the ``[tip]`` settings of a tip model."""
+    if tip.physics != "solid":
+        return {"physics": tip.physics}
+    poisson = round(tip.poisson, 3)
+    return {"physics": "solid", "base": tip.base, "face": tip.face, "poisson": poisson}
 
 
 def _told(fit: TipFit) -> str:
     words = (
-        f"{_name(fit)}: E = {fit.modulus / 1e6:.4f} MPa, zero offset of d {fit.offset * 1e3:.3f} "
-        f"mm, χ² {fit.chi2:.2f} per cell; "
+        f"{tip_name(fit.tip, fit.law)}: E = {fit.modulus / 1e6:.4f} MPa, zero offset of d "
+        f"{fit.offset * 1e3:.3f} mm, χ² {fit.chi2:.2f} per cell; "
     )
     if fit.valid == 0.0:
         return words + "all frames are invalid"
