@@ -13,8 +13,7 @@ from softfinger.tools import cli
 from softfinger.tools.benchmarks import bench, control, estimator, faults, measuring, reflex, tick
 from softfinger.tools.benchmarks.faults import BOUNDED, SETTLES, FaultCase, GripTrial, measure
 from softfinger.tools.benchmarks.measuring import Report, figure, interleave
-from softfinger.tools.benchmarks.rigs import RigError
-from softfinger.tools.benchmarks.virtual_grip import Watch
+from softfinger.tools.benchmarks.rigs import RigError, Watch
 
 
 def test_interleaved_timing(monkeypatch):
@@ -194,7 +193,7 @@ def test_a_watch_measures_forces_times_and_positions():
     watch = Watch(10.0)
     for k, force in enumerate((10.0, 14.0, 15.0, 12.0, 13.5, 9.0, 9.0)):
         place = (0.0, 0.08 + (0.02 if k == 6 else 0.001 * k))
-        watch.see(0.1 * k, (force, 10.0), place, torque=k != 6)
+        watch.see(0.1 * k, (force, 10.0), place, torque=k != 6, goal=10.0)
     assert watch.peak == 1.5
     assert watch.above == pytest.approx(0.1)  # The force exceeds the limit from 0.1 s to 0.2 s.
     assert watch.slid == pytest.approx(0.005)

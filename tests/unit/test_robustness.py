@@ -13,9 +13,8 @@ from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks.rigs import merged
+from softfinger.tools.benchmarks.rigs import VirtualGrip, merged
 from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, drawn_in_mujoco, grip
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
 
 ROW = {case.name: case for case in ROWS}
 LONG = pytest.mark.extended

@@ -1,4 +1,4 @@
-"""Implement ``softfinger bench``. Each measurement has its own module.
+"""Implement ``softfinger bench``; each measurement has its own module.
 
-Several measurements share the modules `measuring`, `rigs` and `virtual_grip`.
+Several measurements share the modules `measuring` and `rigs`.
 """

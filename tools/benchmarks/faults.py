@@ -23,8 +23,7 @@ from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.measuring import Report, Row
-from softfinger.tools.benchmarks.rigs import SOLID, Sections
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, diagnoses
+from softfinger.tools.benchmarks.rigs import SOLID, Sections, VirtualGrip, diagnoses
 
 _TRIAL_COUNT = 20
 _FORCES = (6.0, 12.0)  # requested forces [N]

@@ -20,8 +20,15 @@ from typing import Any, NamedTuple
 
 from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.tools.benchmarks.measuring import Report, Row, figure
-from softfinger.tools.benchmarks.rigs import SENSORS, SOLID, RigError, Sections, merged, must_hold
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip
+from softfinger.tools.benchmarks.rigs import (
+    SENSORS,
+    SOLID,
+    RigError,
+    Sections,
+    VirtualGrip,
+    merged,
+    must_hold,
+)
 
 # Three kinds of tips with an ideal sensor, and spring tips with each defective sensor.
 TIPS: dict[str, Sections] = {
@@ -132,9 +139,7 @@ def overloaded(
         grip.until("holding", _GRIP_TIMEOUT)
         must_hold(state)
         loop.advance(1.0 + chance.uniform(0.0, 0.02))
-        for k in range(_LOAD_STEP_COUNT):
-            grip.plant.load(push=standing * (k + 1) / _LOAD_STEP_COUNT)
-            loop.advance(_LOAD_TIME / _LOAD_STEP_COUNT)
+        grip.pull(standing, _LOAD_TIME, _LOAD_STEP_COUNT)
         loop.advance(_STANDING_TIME)
         begin, slid, gone, said = fmean(grip.along()), 0.0, math.inf, math.inf
 

@@ -25,8 +25,13 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.faults import EIGHT_BITS
 from softfinger.tools.benchmarks.measuring import Report
-from softfinger.tools.benchmarks.rigs import SENSORS, Sections, merged
-from softfinger.tools.benchmarks.virtual_grip import VirtualGrip, Watch, diagnoses
+from softfinger.tools.benchmarks.rigs import (
+    SENSORS,
+    Sections,
+    VirtualGrip,
+    diagnoses,
+    merged,
+)
 
 _TRIAL_COUNT, _HAND_COUNT, _MUJOCO_COUNT = 20, 400, 100
 # Time limit for reaching the mode `holding`, undisturbed holding time, and observation time [s].
@@ -240,14 +245,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
             loop.advance(0.5)
         hand.command("arm")
         loop.advance(0.1 + chance.uniform(0.0, 0.02))
-        watch, begin = Watch(case.force, _EXCESS_RATIO), state.t
-
-        def look() -> None:
-            forces = hand.plant.force.tolist()
-            watch.see(state.t, forces, hand.plant.object_pose[:2].tolist(), state.torque)
-            found.raised = found.raised or state.goal.force > 1.02 * case.force
-
-        hand.look = look
+        watch, begin = hand.watched(case.force, _EXCESS_RATIO), state.t
         hand.command("grasp", force=case.force)
         found.held = hand.until("holding", _GRIP_TIMEOUT)
         loop.advance(_REST_TIME + chance.uniform(0.0, 0.02))
@@ -263,13 +261,11 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
             found.estimate_error = float((off / hand.plant.force).mean())
             found.inside_count = int(np.count_nonzero(np.abs(off) < _SIGMA * std))
             found.angle_error = float(hand.plant.object_pose[2]) - case.turn
-        found.peak, found.above = watch.peak, watch.above
+        found.peak, found.above, found.raised = watch.peak, watch.above, watch.raised
         found.first_off = watch.first_off(_ERROR_MAX)
         if case.load and gripped and hand.between():
             hand.look = lambda: None  # Observe only the grip without the load.
-            for k in range(_STEPS := 20):
-                hand.plant.load(push=case.load * (k + 1) / _STEPS)
-                loop.advance(case.within / _STEPS)
+            hand.pull(case.load, case.within, 20)
             loop.advance(2.0)
             found.lost = not hand.between()
         found.end = state.fault_name or str(state.mode)

@@ -10,27 +10,34 @@ timed over one second of virtual time.
 from __future__ import annotations
 
 import contextlib
+import random
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import zmq
+from numpy.typing import NDArray
 
-from softfinger.daemon.clock import RealClock
+from softfinger.daemon.client.connection import subscribe
+from softfinger.daemon.clock import Clock, RealClock
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.realtime import RealTime
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.tactile.replay import GivenFrames
+from softfinger.daemon.types import Frame, Goal, Reading
 from softfinger.daemon.wire import schema
 from softfinger.tools.benchmarks.measuring import Report, attempt, figure, timed
-from softfinger.tools.benchmarks.rigs import can, hold, must_hold, virtual_daemon
+from softfinger.tools.benchmarks.rigs import must_hold
 from softfinger.tools.processes.emulate import emulator_process
 
 _PRIORITY = 40  # SCHED_FIFO priority
 # Bits per cycle for a fast sync read of 2 × 10 bytes, its reply, and a sync write of 2 × 6 bytes.
 _BITS = 10 * (16 + 36 + 28)
+_FRAME_COUNT = 16  # number of frames that are stored for each canned sensor
 _IN_TURN = 20  # number of cycles before switching between ticks and exchanges
 
 
@@ -159,3 +166,113 @@ def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) 
         over = np.array(back_to_back) / (1e6 * _BITS / baud)
         rows.append(figure("read + write over its bytes' own time", "×", over, 1.15))
     return Report(title, rows)
+
+
+@contextlib.contextmanager
+def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
+    """Yield a virtual-time daemon with private addresses, and subscribe to ``topics``."""
+    with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
+        sections = {
+            "loop": {"clock": "virtual"},
+            "stream": {"address": f"ipc://{folder}/stream"},
+            "commands": {"address": f"ipc://{folder}/commands"},
+        }
+        settings = Settings.model_validate(sections)
+        with Daemon(settings) as daemon:
+            if topics:
+                subscribe(context, settings.stream.address, *topics)
+            try:
+                yield daemon
+            finally:
+                context.destroy()
+
+
+def hold(daemon: Daemon) -> None:
+    """Grasp the simulated object with 8 N.
+
+    Raises RigError if the object is not held within 10 s, and Refused if a command is refused.
+    """
+    loop = daemon.loop
+    loop.advance(0.2)
+    loop.command({"command": "arm"})
+    loop.advance(0.2)
+    loop.command({"command": "grasp", "force": 8.0})
+    for _ in range(10):
+        loop.advance(1.0)
+        if loop.state.mode == "holding":
+            break
+    must_hold(loop.state)
+
+
+class CannedServos:
+    """Servo backend that repeats one reading and ignores goals."""
+
+    def __init__(self, reading: Reading, clock: Clock) -> None:
+        self._clock = clock
+        self._q = reading.q.copy()
+        self._current = reading.current.copy()
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    connect = torque_on = close
+
+    def counters(self) -> dict[str, int]:
+        """Return an empty dictionary."""
+        return {}
+
+    def read(self, reading: Reading) -> None:
+        """Repeat the reading with a new timestamp."""
+        reading.seq += 1
+        reading.valid = True
+        reading.t = self._clock.now()
+        reading.q[:] = self._q
+        reading.current[:] = self._current
+
+    def torque_off(self, reading: Reading) -> bool:
+        """Confirm torque off immediately."""
+        self.read(reading)
+        return True
+
+    def write(self, goal: Goal) -> None:
+        """Ignore the goal."""
+
+
+class CannedSensor(GivenFrames):
+    """Sensor backend that returns a few stored frames in random order, one every ``period`` s."""
+
+    def __init__(self, counts: list[NDArray[np.uint16]], period: float, clock: Clock) -> None:
+        super().__init__()
+        self._counts = counts
+        self._period = period
+        self._clock = clock
+        self._chance = random.Random(1)
+        self._last = Frame(1, clock.now(), clock.now(), True, counts[0])
+
+    def latest(self) -> Frame:
+        """Return the current frame."""
+        now = self._clock.now()
+        if now - self._last.t_arrival >= self._period:
+            seq = self._last.seq + 1
+            self._last = Frame(seq, now, now, True, self._chance.choice(self._counts))
+        return self._last
+
+
+def can(daemon: Daemon) -> None:
+    """Replace a daemon's backends with canned backends, so that only the tick itself is timed.
+
+    The canned backends repeat the last reading and the next few frames. Several frames are used,
+    because the daemon would diagnose a repeated frame as a frozen sensor.
+    """
+    loop, period = daemon.loop, 1.0 / daemon.settings.tactile.rate
+    fingers = loop.perception.fingers
+    grids: list[list[NDArray[np.uint16]]] = [[] for _ in fingers]
+    for _ in range(_FRAME_COUNT):
+        loop.advance(period)
+        for kept, finger in zip(grids, fingers, strict=True):
+            assert finger.frame is not None
+            kept.append(finger.frame.data)
+    for kept, finger in zip(grids, fingers, strict=True):
+        finger.sensor = CannedSensor(kept, period, daemon.clock)
+    if loop.torque.servos is not None:
+        loop.torque.servos = CannedServos(loop.state.reading, daemon.clock)
