@@ -230,7 +230,7 @@ def exponents() -> str:
 def early_minimum() -> str:
     """Tabulate the angles of minimum force and energy if part of the rolling shears the tip."""
     from softfinger.tools.paper.model_pages import DEPTHS
-    from softfinger.tools.paper.sheared_rolling import sheared_rolling
+    from softfinger.tools.paper.sheared_pages import sheared_rolling
 
     *_, minima, plant = sheared_rolling()
     names = ("least F on the base", "least U")

@@ -6,7 +6,7 @@ from functools import reduce
 import numpy as np
 import pytest
 
-from softfinger.tools.paper import run_pages, slow_turn
+from softfinger.tools.paper import run_pages, sheared_pages
 from softfinger.tools.paper.model_pages import DEPTHS, TILTS
 from softfinger.tools.paper.sheets import Sheet
 
@@ -58,23 +58,23 @@ def test_the_path_equals_that_of_the_paper(path):
 @pytest.fixture(scope="module")
 def sheets() -> tuple[Sheet, ...]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(slow_turn, "_SWING_TIME", 2.0)  # s
-        slow_turn.slow_turn.cache_clear()
-        found = slow_turn.slow_turn()
-        slow_turn.slow_turn.cache_clear()
+        patch.setattr(sheared_pages, "_SWING_TIME", 2.0)  # s
+        sheared_pages.slow_turn.cache_clear()
+        found = sheared_pages.slow_turn()
+        sheared_pages.slow_turn.cache_clear()
     return found
 
 
 def test_forces_are_energy_derivatives():
     """Compare the joint torques with finite differences of the energy along rolling motions."""
-    here = reduce(slow_turn.turned, np.radians([2.0, 4.0]), slow_turn.gripped())
+    here = reduce(sheared_pages.turned, np.radians([2.0, 4.0]), sheared_pages.gripped())
     step = 1e-6
     for k in range(5):
         moved = []
         for sign in (1.0, -1.0):
             x = np.r_[here.pose, here.q]
             x[k] += sign * step
-            moved.append(slow_turn.held(x[3:], x[:3], here).energy())
+            moved.append(sheared_pages.held(x[3:], x[:3], here).energy())
         slope = (moved[0] - moved[1]) / (2.0 * step)
         expected = 0.0 if k < 3 else here.torques()[k - 3]
         assert slope == pytest.approx(expected, abs=1e-5)
@@ -83,7 +83,7 @@ def test_forces_are_energy_derivatives():
 @pytest.mark.extended
 def test_the_path_follows_the_valley_floor(sheets):
     equations, _, land = sheets
-    for antisymmetric in slow_turn.ANTISYMMETRIC_ANGLES:
+    for antisymmetric in sheared_pages.ANTISYMMETRIC_ANGLES:
         angle, v = land[f"angle at {antisymmetric} deg"], land[f"V at {antisymmetric} deg"]
         parabola = np.polyfit(angle[15:26], v[15:26], 2)
         assert parabola[0] > 0.1  # mJ/°²
@@ -97,7 +97,7 @@ def test_the_path_follows_the_valley_floor(sheets):
 def test_the_simulated_hand_follows_the_path_of_the_equations(sheets):
     equations, plant, _ = sheets
     order = np.argsort(equations["angle"])
-    assert math.degrees(slow_turn.REACH) - 0.5 < np.max(plant["angle"])
+    assert math.degrees(sheared_pages.REACH) - 0.5 < np.max(plant["angle"])
     for name, within in (("lean", 0.01), ("energy of both tips", 0.02), ("shear force", 0.02)):
         there = np.interp(plant["angle"], equations["angle"][order], equations[name][order])
         assert np.abs(plant[name] - there).max() < within, name

@@ -39,15 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def pages() -> dict[str, FigurePage]:
     """Return all figures by name."""
-    from softfinger.tools.paper import (
-        experiment_pages,
-        model_pages,
-        run_pages,
-        sheared_rolling,
-        slow_turn,
-    )
+    from softfinger.tools.paper import experiment_pages, model_pages, run_pages, sheared_pages
 
-    modules = (model_pages, experiment_pages, run_pages, sheared_rolling, slow_turn)
+    modules = (model_pages, experiment_pages, run_pages, sheared_pages)
     found = {name: page for each in modules for name, page in each.PAGES.items()}
     return {name: found[name] for name in (*NAMES, *BY_NAME)}
 

@@ -41,6 +41,7 @@ RADIUS = 0.020  # m
 SCAN = 0.040  # s
 TILTED = math.radians(11.5)  # rotation of the finger about its root [rad]
 ROLLED = math.radians(20.7)  # rotation of the object while it rolls back [rad]
+_NOISE = 0.005 * MODULUS  # Pa
 _SPEED = 0.002  # compression speed [m/s]
 _GAP = 0.5e-3  # gap before compression [m]
 _D_MAX = 0.4 * RADIUS
@@ -54,6 +55,12 @@ _RELATIVE_D_MIN = 1.0  # displacement above which errors are shown [mm]
 _ROLLED_AT = 4  # displacement in the panels that show the whole path [mm]
 _PATH = -12.5, 10.5
 _SCALES = {"d": 1e3, "theta": 1.0}  # factors for displayed errors
+# Settings for an object that `roll` moves over a fixed finger.
+ROLLING: Sections = {
+    "servos": {"backend": "none"},
+    "hand": {"open_angle": (TILTED, 0.0)},
+    "simulation": {"compression_speed": 0.0},
+}
 
 
 def run_compression(tilt: float) -> dict[str, FloatArray]:
@@ -68,7 +75,7 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
         },
     }
     seconds = (_D_MAX + _GAP) / math.cos(tilt) / _SPEED
-    with _daemon(sections) as daemon:
+    with Daemon(settings_of(sections), wire=False) as daemon:
         return _columns(_frames(daemon, round(seconds / SCAN)), daemon)
 
 
@@ -82,12 +89,9 @@ def run_rotation() -> dict[str, FloatArray]:
     sections: Sections = {
         "hand": {"finger_length": length},
         "control": {"move_speed": 0.05},
-        "simulation": {
-            "object_position": (-_HALF_SEPARATION + RADIUS + 0.5 * _WIDTH, length),
-            "object_height": 0.2,
-        },
+        "simulation": {"object_position": (-_HALF_SEPARATION + RADIUS + 0.5 * _WIDTH, length)},
     }
-    with _daemon(sections) as daemon:
+    with Daemon(settings_of(sections), wire=False) as daemon:
         loop = daemon.loop
         loop.advance(0.3)
         loop.command({"command": "arm"})
@@ -106,41 +110,32 @@ def run_rotation() -> dict[str, FloatArray]:
 
 def run_rolling(depth: int) -> dict[str, FloatArray]:
     """Roll the object over the fixed finger from 11.5° to −9.2° at constant ``depth`` [mm]."""
-    sections: Sections = {
-        "servos": {"backend": "none"},
-        "hand": {"open_angle": (TILTED, 0.0)},
-        "simulation": {"object_height": 0.2, "compression_speed": 0.0},
-    }
 
     def place(hand: SimulatedHand, fraction: float) -> None:
         roll(hand, depth * MILLI, -ROLLED * fraction)
 
-    with _daemon(sections) as daemon:
+    with Daemon(settings_of(ROLLING), wire=False) as daemon:
         rows = _frames(daemon, _ROLL_STEPS, place)
         return _columns(rows, daemon, f" at {depth} mm", -1.0)
 
 
-def _daemon(sections: Sections) -> Daemon:
+def settings_of(sections: Sections) -> Settings:
+    """Return settings for the left finger and the paper's tip and sensor."""
     base: Sections = {
         "scene": {"fingers": ("left",)},
         "tip": {"radius": RADIUS},
         "material": {"law": "constant", "modulus": MODULUS},
         # The sensor is calibrated, so the estimator attributes excess pressure to the tip's
         # stiffness.
-        "tactile": {
-            "rate": 1.0 / SCAN,
-            "latency": SCAN,
-            "noise": 0.005 * MODULUS,
-            "gain_error": 1e-3,
-        },
+        "tactile": {"rate": 1.0 / SCAN, "latency": SCAN, "noise": _NOISE, "gain_error": 1e-3},
         "loop": {"clock": "virtual"},
         "simulation": {
             "tactile_delay": SCAN,
-            "tactile_noise": 0.005 * MODULUS,
+            "tactile_noise": _NOISE,
             "object_height": 0.2,
         },
     }
-    return Daemon(Settings.model_validate(merged(sections, base)), wire=False)
+    return Settings.model_validate(merged(sections, base))
 
 
 def _frames(
@@ -221,7 +216,7 @@ def compression() -> tuple[Sheet, ...]:
         run = Sheet(f"fig7_run_{tilt}deg", run_compression(float(np.radians(tilt))))
         sheets.append(run)
         force, energy = (_deep_errors(run, symbol) for symbol in "FU")
-        row = {
+        rows.append({
             "tilt [deg]": tilt,
             "d at the first estimate [mm]": run["d"][run["d estimated"] > 0.0][0],
             "RMS error of d [um]": _rms(_deep_errors(run, "d")),
@@ -229,8 +224,7 @@ def compression() -> tuple[Sheet, ...]:
             "mean error of F [%]": force.mean(),
             "RMS error of F [%]": _rms(force),
             "RMS error of U [%]": _rms(energy),
-        }
-        rows.append(row)
+        })  # fmt: skip
     return (*sheets, summary("fig7_run_errors", rows))
 
 

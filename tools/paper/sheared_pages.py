@@ -1,15 +1,33 @@
-"""Compute a quasi-static manipulation (section V), and compare it with the simulated hand.
+"""Draw two figures for tips whose springs are sheared (sections IV-B and V).
 
-Both tips consist of the paper's springs and stick to the object. The model does not include any
-other friction. The energy and the shear rate of a tip with shear ζ are
+The springs of the parallel distributed model have equal lateral and axial stiffness. The energy and
+the force of a tip with the shear ζ are
 
-    U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
+    U = πE [d³/(3 cos² θ) + d² ζ tan θ + d ζ²]      F = πE [d²/cos θ + 2 d ζ sin θ]
 
-The shear rate is the rolling speed (a − d) θ̇ minus two terms. ṡ is the sliding speed along the
-face. ḋ tan θ is the compression speed's component along a tilted face. The quantities s, d and θ
-are defined in `kinematics.hand.geometry`; the right tip's θ is mirrored. The object is in
-equilibrium if Σ δU = 0 for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ,
-the condition becomes
+F is the sum of the spring forces on the base. A sensor under the tip measures this sum.
+
+`sheared_rolling` shows that shear during rolling moves the minima of F and U to θ < 0. The finger
+is tilted to −11.5°. From this tilt, the object rolls to 9.2° at constant displacement d. A fraction
+s of the face motion shears the tip; the remainder is pure rolling. The shear is
+
+    ζ = s (a − d) (θ − θ₀),    θ₀ = −11.5°
+
+The terms with ζ sin θ and ζ tan θ have the sign of θ, so F and U reach their minima before the
+upright position. ∂U/∂d is the force on the face at fixed tilt and shear. The minimum of ∂U/∂d lies
+between the minima of F and U. *Plant* is the simulated tip, which integrates the shear. The force
+on the plant's base is N cos θ + T sin θ. This force exceeds F by πE ζ² cos θ, because the plant
+shears each spring from its first touch at the contact rim.
+
+`slow_turn` computes a quasi-static manipulation, and compares it with the simulated hand. Both tips
+stick to the object. The model does not include any other friction. The shear rate is
+
+    ζ̇ = −ṡ + (a − d) θ̇ − ḋ tan θ
+
+i.e. the rolling speed (a − d) θ̇ minus two terms. ṡ is the sliding speed along the face. ḋ tan θ is
+the compression speed's component along a tilted face. The quantities s, d and θ are defined in
+`kinematics.hand.geometry`; the right tip's θ is mirrored. The object is in equilibrium if Σ δU = 0
+for each possible motion. With M = ∂U/∂θ, T = ∂U/∂ζ and N = ∂U/∂d − T tan θ, the condition becomes
 
     Σ N δd + M δθ + T (−δs + (a − d) δθ) = 0
 
@@ -27,26 +45,143 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from softfinger.daemon.simulation.physics.plant_state import ALONG_SHEAR
+from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.hand.geometry import HandGeometry, tip_velocity
-from softfinger.tools.paper.model_pages import MODULUS
-from softfinger.tools.paper.sheets import FigurePage, FloatArray, Panel, Sheet, summary
+from softfinger.tools.paper.model_pages import DEPTHS, MILLI, MODULUS, TIP
+from softfinger.tools.paper.run_pages import ROLLED, ROLLING, TILTED, roll, settings_of
+from softfinger.tools.paper.sheets import (
+    DOT,
+    RELATIVE,
+    FigurePage,
+    FloatArray,
+    Panel,
+    Sheet,
+    summary,
+)
 from softfinger.tools.simulated_daemon import SimulatedDaemon
-from softfinger.tools.style import INK, KINDS, ordered
+from softfinger.tools.style import GREY, INK, KINDS, ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+# Rolling with shear
+
+SHARES = (0.0, 0.02, 0.05, 0.1)  # values of the fraction s in the figure
+_EACH = tuple(k / 100.0 for k in range(11))
+DEPTH, SHARE = 6, 0.05  # displacement shown in the figure [mm], and fraction s simulated
+_ROLL_STEPS = 208
+_FORCE, _SLOPE, _ENERGY = "F on the base", "dU/dd", "U"
+
+
+def rolled(d: float, share: float, theta: FloatArray) -> dict[str, FloatArray]:
+    """Return F [N], ∂U/∂d [N] and U [mJ] at tilts ``theta`` [rad] and constant ``d`` [m]."""
+    shear = share * (TIP.radius - d) * (theta + TILTED)
+    sine, cosine, tangent = np.sin(theta), np.cos(theta), np.tan(theta)
+    stiff = math.pi * MODULUS
+    return {
+        _FORCE: stiff * (d**2 / cosine + 2.0 * d * shear * sine),
+        _SLOPE: stiff * (d**2 / cosine**2 + 2.0 * d * shear * tangent + shear**2),
+        _ENERGY: 1e3 * stiff * (d**3 / (3.0 * cosine**2) + d**2 * shear * tangent + d * shear**2),
+    }
+
+
+def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Simulate the tip at ``d`` [m]; return θ [rad], N cos θ + T sin θ [N] and U [mJ]."""
+    hand = SimulatedHand(settings_of(ROLLING))
+    tip = hand.plant.stages[0].on_object[0]
+    rows = []
+    for k in range(_ROLL_STEPS + 1):
+        before, row = hand.object_pose.copy(), tip.rows[ALONG_SHEAR, 1:].copy()
+        roll(hand, d, -ROLLED * k / _ROLL_STEPS, 1.0 - share)
+        if k:
+            row = 0.5 * (row + tip.rows[ALONG_SHEAR, 1:])
+            hand.shear[0] += row @ (hand.object_pose - before)
+            hand.refresh()
+        theta = float(hand.theta[0])
+        base = hand.normal[0] * math.cos(theta) + hand.tangential[0] * math.sin(theta)
+        rows.append((-theta, base, 1e3 * tip.energy))
+    theta, base, energy = np.array(rows).T
+    return theta, base, energy
+
+
+def angle_of_minimum(theta: FloatArray, values: FloatArray) -> float:
+    """Return the angle of the minimum [degrees], from a parabola through three points."""
+    k = int(np.clip(np.argmin(values), 1, len(values) - 2))
+    near = slice(k - 1, k + 2)
+    a, b, _ = np.polyfit(theta[near] - theta[k], values[near], 2)
+    return math.degrees(theta[k] - 0.5 * b / a)
+
+
+@cache
+def sheared_rolling() -> tuple[Sheet, ...]:
+    """Return model and plant curves at one depth, and the minima at all depths."""
+    theta = np.linspace(-TILTED, ROLLED - TILTED, _ROLL_STEPS + 1)
+    columns = {"theta [deg]": np.degrees(theta)}
+    rows = []
+    for depth in DEPTHS:
+        d = depth * MILLI
+        for share in _EACH:
+            curves, row = rolled(d, share, theta), {"d [mm]": depth, "share [%]": 100.0 * share}
+            for name, each in curves.items():
+                row[f"least {name} [deg]"] = angle_of_minimum(theta, each)
+            rows.append(row)
+            if depth == DEPTH and share in SHARES:
+                columns[f"F on the base, {share:.0%} [N]"] = curves[_FORCE]
+                columns[f"U, {share:.0%} [mJ]"] = curves[_ENERGY]
+    seen = {depth: plant(depth * MILLI, SHARE) for depth in DEPTHS}
+    felt = [
+        {
+            "d [mm]": depth,
+            "share [%]": 100.0 * SHARE,
+            "least N cos theta + T sin theta [deg]": angle_of_minimum(tilt, base),
+            "least U [deg]": angle_of_minimum(tilt, energy),
+        }
+        for depth, (tilt, base, energy) in seen.items()
+    ]
+    tilt, base, energy = seen[DEPTH]
+    run = {"theta [deg]": np.degrees(tilt), "F on the base [N]": base, "U [mJ]": energy}
+    return (
+        Sheet("fig10_shear", columns),
+        Sheet("fig10_shear_plant", run),
+        summary("fig10_shear_minima", rows),
+        summary("fig10_shear_plant_minima", felt),
+    )
+
+
+def _curves(name: str, axes: Axes, model: Sheet, run: Sheet, *_: Sheet) -> None:
+    theta = model["theta"]
+    upright = float(np.interp(0.0, theta, model[f"{name}, 0%"]))
+    for share, style in ordered(SHARES):
+        ratio = model[f"{name}, {share:.0%}"] / upright
+        axes.plot(theta, ratio, **style, label=f"{share:.0%} shear")
+        where = angle_of_minimum(np.radians(theta), ratio)
+        axes.plot(where, np.interp(where, theta, ratio), "v", ms=6, color=style["color"])
+    axes.plot(run["theta"][::13], run[name][::13] / upright, **DOT, label=f"plant, {SHARE:.0%}")
+
+
+def _minima(axes: Axes, _model: Sheet, _run: Sheet, minima: Sheet, felt: Sheet) -> None:
+    axes.axhline(0.0, color=GREY, linewidth=0.7)
+    for depth, style in ordered(DEPTHS):
+        rows = minima["d"] == depth
+        axes.plot(
+            minima["share"][rows], minima[f"least {_ENERGY}"][rows], **style, label=f"{depth} mm"
+        )
+    axes.plot(felt["share"], felt["least U"], **DOT, label="plant")
+
+
+# A slow turn
 
 FORCE, WIDTH = 10.0, 0.040  # force on the base of each tip [N], and object width [m]
 REACH = math.radians(8.0)  # maximum object angle in each direction [rad]
 ANTISYMMETRIC_ANGLES = (-4, -2, 0, 2, 4)  # degrees
 _SWING_TIME = 4.0  # duration of a swing from 0 to REACH [s]
 _SIDE_ANGLES = np.radians(np.linspace(-2.5, 2.5, 41))
-_STEPS = 64
+_TURN_STEPS = 64
 _FRICTION = 0.6
 _SIDES = np.array([1.0, -1.0])
 _HAND = HandGeometry()
 _GRIP = 3.0  # s
-_FREE = {"table_friction": 0.0, "joint_friction": 0.0}
 
 
 class Held(NamedTuple):
@@ -97,16 +232,11 @@ class Held(NamedTuple):
         angle = self.pose[2]
         across, along = [math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]
         tips = _HAND.tips(self.q) - self.pose[:2]
-        out = np.zeros(4)
-        out[:2] = -((_SIDES * normal) @ np.outer([1, 1], across)) + tangential.sum() * np.array(
-            along
-        )
+        push = tangential.sum() * np.array(along) - (_SIDES * normal) @ np.outer([1, 1], across)
         rolls = moment + tangential * (_HAND.tip_radius - self.d)
         turns = normal * _SIDES * (tips @ along) + tangential * (tips @ across) + _SIDES * rolls
-        out[2] = turns.sum() / WIDTH
         force = math.pi * MODULUS * self.d**2 / np.cos(self.theta)
-        out[3] = force.mean() - FORCE
-        return out
+        return np.array([*push, turns.sum() / WIDTH, force.mean() - FORCE])
 
 
 def held(q: FloatArray, pose: FloatArray, last: Held | None) -> Held:
@@ -196,7 +326,7 @@ def swing() -> list[dict[str, float]]:
     """
     sections: dict[str, dict[str, Any]] = {
         "material": {"law": "constant", "modulus": MODULUS},
-        "simulation": _FREE,
+        "simulation": {"table_friction": 0.0, "joint_friction": 0.0},
     }
     rows = []
     with SimulatedDaemon(sections) as hand:
@@ -216,14 +346,13 @@ def swing() -> list[dict[str, float]]:
             shear = (sheared - found.gradient()[2]) / (2.0 * math.pi * MODULUS * found.d)
             scale = FORCE / hand.plant.force.mean()
             energy = found._replace(shear=shear).energy() * scale**1.5
-            row = {
+            rows.append({
                 "t [s]": t,
                 "angle [deg]": math.degrees(found.pose[2]),
                 "lean [deg]": math.degrees(0.5 * (found.q[0] - found.q[1])),
                 "energy of both tips [mJ]": 1e3 * energy,
                 "shear force [N]": sheared[0] * scale,
-            }
-            rows.append(row)
+            })  # fmt: skip
     return rows
 
 
@@ -235,8 +364,8 @@ def _triangle(turns: float) -> float:
 @cache
 def slow_turn() -> tuple[Sheet, ...]:
     """Return three sheets: the computed path, the plant's path, and V versus the object angle."""
-    there = np.linspace(0.0, REACH, _STEPS + 1)[1:]
-    back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _STEPS + 1)]
+    there = np.linspace(0.0, REACH, _TURN_STEPS + 1)[1:]
+    back = np.r_[there[-2::-1], -np.linspace(0.0, REACH, _TURN_STEPS + 1)]
     start = gripped()
     path = list(itertools.accumulate(np.r_[there, back], turned, initial=start))
     antisymmetric = np.array([0.5 * (each.q[0] - each.q[1]) for each in path])
@@ -276,6 +405,25 @@ def _both(name: str, axes: Axes, equations: Sheet, plant: Sheet, _: Sheet) -> No
 
 _ANGLE = "object's angle φ [deg]"
 PAGES = {
+    "fig10_shear": FigurePage(
+        "Sec. IV-B: the minimum slightly before 0°, from the tip's tangential force",
+        (9.6, 4.0),
+        sheared_rolling,
+        (
+            Panel(partial(_curves, _FORCE), RELATIVE, "F(θ)/F(0) without shear",
+                  f"(a) force on the base, d = {DEPTH} mm", None, (0.99, 1.07), "upper center"),
+            Panel(partial(_curves, _ENERGY), RELATIVE, "U(θ)/U(0) without shear",
+                  f"(b) energy, d = {DEPTH} mm", None, (0.98, 1.14), "upper center"),
+            Panel(_minima, "share of shear in the motion [%]", "angle of the minimum of U [deg]",
+                  "(c) angle of the minimum of U", None, None, "lower left"),
+        ),
+        notes=(
+            "The object rolls from −11.5° to 9.2° at a fixed d. The share s of the motion that "
+            "is not rolling shears the tip by s (a − d)(θ + 11.5°). The paper attributes the "
+            "shift to lateral springs; these springs, as stiff across their axes as along them, "
+            "reproduce it.",
+        ),
+    ),
     "slow_turn": FigurePage(
         "A slow turn on the energy landscape: Sec. V's quasi-static manipulation",
         (8.4, 6.6),
