@@ -101,14 +101,9 @@ def _tips() -> Iterator[PublishedValue]:
     yield between("γ of the contact radius, c N^γ: springs", 0.0, 1.0 / 3.0,
                   "Xydas & Kao, IJRR 18(9), 1999",
                   exponent(math.pi * MODULUS * DEPTHS**2, radius))  # fmt: skip
-    yield PublishedValue(
-        "γ of the contact radius: solid",
-        "0.00 to 0.33",
-        "Xydas & Kao, IJRR 18(9), 1999",
-        "—",
-        "unknown",
-        "the data contain only the pressure under the base, not on the face",
-    )
+    yield PublishedValue("γ of the contact radius: solid", "0.00 to 0.33",
+                         "Xydas & Kao, IJRR 18(9), 1999", "—", "unknown", "the data contain only "
+                         "the pressure under the base, not on the face")  # fmt: skip
     springs = _table("springs")
     hertz = 4.0 / 3.0 * MODULUS / 0.75 * math.sqrt(TIP.radius)
     d = np.linspace(0.004, 0.0079, 3901)
@@ -118,81 +113,49 @@ def _tips() -> Iterator[PublishedValue]:
 
 
 def _energy() -> Iterator[PublishedValue]:
-    from softfinger.tools.paper import sheared_rolling
+    from softfinger.tools.paper import sheared_pages
 
     source = "Inoue & Hirai, the source of this model"
     for law in _LAWS:
         energy = _table(law)(0.004, TILTS).energy
         minimum = math.degrees(TILTS[int(np.argmin(energy))])
-        why = (
-            ""
-            if minimum == 0.0
-            else f"at a fixed d, the energy decreases with the tilt until {minimum:.0f}° (tested: "
-            "0 to 20°)"
-        )
+        falls = f"the energy decreases with the tilt until {minimum:.0f}° (tested: 0 to 20°)"
+        why = f"at a fixed d, {falls}" if minimum > 0.0 else ""
         yield between(f"tilt of minimum U at d = 4 mm: {law}", 0.0, 0.0, source, minimum, ".1f",
                       "°", why)  # fmt: skip
     theta = np.radians(np.linspace(-11.5, 9.2, 208))
-    rolled = sheared_rolling.rolled(0.006, 0.05, theta)
-    before = sheared_rolling.angle_of_minimum(theta, rolled["F on the base"])
-    yield PublishedValue(
-        "tilt of minimum force while rolling, d = 6 mm: springs",
-        "slightly before 0°",
-        source,
-        f"{before:.1f}°",
-        "agree" if -3.0 < before < 0.0 else "disagree",
-        "if 5 % of the rolling motion shears the tip",
-    )
+    rolled = sheared_pages.rolled(0.006, 0.05, theta)
+    before = sheared_pages.angle_of_minimum(theta, rolled["F on the base"])
+    verdict = "agree" if -3.0 < before < 0.0 else "disagree"
+    yield PublishedValue("tilt of minimum force while rolling, d = 6 mm: springs",
+                         "slightly before 0°", source, f"{before:.1f}°", verdict,
+                         "if 5 % of the rolling motion shears the tip")  # fmt: skip
     d, chosen = 1e-3 * np.arange(8, 33) / 4.0, Material.constant(1.0)
     for face in ("frictionless", "sticking"):
         solid = ContactTable.build(replace(_LAWS["solid, bonded"], face=face), chosen)(d, 0.0).force
         springs = _table("springs")(d, 0.0).force
         modulus = float(np.polyfit(solid, springs, 1)[0])
         over = modulus * solid - springs
-        yield PublishedValue(
-            f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
-            "constant",
-            source,
-            f"{over.min():.1f} to {over.max():.1f} N",
-            "disagree",
-            f"with the best-fitting E, {1e-6 * modulus:.3f} MPa",
-        )
+        yield PublishedValue(f"Fig. 7's offset from springs, 2 to 8 mm: solid, bonded, {face}",
+                             "constant", source, f"{over.min():.1f} to {over.max():.1f} N",
+                             "disagree", "with the best-fitting E, "
+                             f"{1e-6 * modulus:.3f} MPa")  # fmt: skip
 
 
 def _relaxation() -> Iterator[PublishedValue]:
-    times = Settings().tip.relaxation_times
-    yield PublishedValue(
-        "relaxation of a fingerpad",
-        "4 ms, 70 ms, 1.4 s",
-        "Pawluk & Howe, 1999",
-        ", ".join(f"{t:g} s" for t in times),
-        "unknown",
-        "the defaults are the published values; `calibrate relaxation` measures the amplitudes",
-    )
-    yield PublishedValue(
-        "stability of a grasp over time",
-        "increases",
-        "Tiezzi & Kao, T-RO 23(2), 2007",
-        "—",
-        "unknown",
-        "not investigated here",
-    )
-    yield PublishedValue(
-        "softening in the first load cycles",
-        "all tested elastomers",
-        "Case et al., Soft Robotics 2015",
-        "none",
-        "disagree",
-        "the simulated tips do not soften",
-    )
-    yield PublishedValue(
-        "shear on a sticking face",
-        "depends on the path",
-        "HydroShear, arXiv 2603.00446",
-        "one path",
-        "disagree",
-        "the data contain only straight presses along the normal",
-    )
+    times = ", ".join(f"{t:g} s" for t in Settings().tip.relaxation_times)
+    yield PublishedValue("relaxation of a fingerpad", "4 ms, 70 ms, 1.4 s", "Pawluk & Howe, 1999",
+                         times, "unknown", "the defaults are the published values; `calibrate "
+                         "relaxation` measures the amplitudes")  # fmt: skip
+    yield PublishedValue("stability of a grasp over time", "increases",
+                         "Tiezzi & Kao, T-RO 23(2), 2007", "—", "unknown",
+                         "not investigated here")  # fmt: skip
+    yield PublishedValue("softening in the first load cycles", "all tested elastomers",
+                         "Case et al., Soft Robotics 2015", "none", "disagree",
+                         "the simulated tips do not soften")  # fmt: skip
+    yield PublishedValue("shear on a sticking face", "depends on the path",
+                         "HydroShear, arXiv 2603.00446", "one path", "disagree",
+                         "the data contain only straight presses along the normal")  # fmt: skip
 
 
 def _sensors() -> Iterator[PublishedValue]:
@@ -229,11 +192,5 @@ def _hands() -> Iterator[PublishedValue]:
     yield between("maximum time from the onset of slip to a force increase", 0, 40,
                   "reaction in 35 to 40 ms, arXiv 2602.16127; humans 100 ms, Delhaye 2024",
                   1e3 * max(answers), ".0f", " ms", simulated)  # fmt: skip
-    yield PublishedValue(
-        "all results on physical hardware",
-        "—",
-        "none yet",
-        "—",
-        "unknown",
-        "softfinger has not been tested on physical hardware",
-    )
+    yield PublishedValue("all results on physical hardware", "—", "none yet", "—", "unknown",
+                         "softfinger has not been tested on physical hardware")  # fmt: skip
