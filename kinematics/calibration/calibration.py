@@ -301,7 +301,7 @@ def golden_section(cost: Callable[[float], float], low: float, high: float, with
     return 0.5 * (low + high)
 
 
-def above_zero(readings: FloatArray, noise: FloatArray, frames: int) -> FloatArray:
+def above_zero(readings: FloatArray, noise: float, frames: int) -> FloatArray:
     """Set mean readings [rows, cols] below 4 σ to 0; ``frames`` is the number of frames averaged.
 
     Clipped noise has a positive mean. Summed over all cells, this mean may be as large as the force

@@ -167,7 +167,7 @@ def test_the_modulus_is_recovered_from_a_compression_with_unknown_zero_offset():
 
 
 def test_clipped_noise_far_from_the_contact_is_removed():
-    noise = np.full((32, 32), 3.0)
+    noise = 3.0
     reading = np.maximum(3.0 * RNG.standard_normal((16, 32, 32)).mean(axis=0), 0.0)
     assert above_zero(reading, noise, 16).sum() <= 0.01 * reading.sum() + 8.0
     reading[4, 4] = 50.0

@@ -18,21 +18,9 @@ from softfinger.tools.recordings.reader import Recording
 if TYPE_CHECKING:
     from softfinger.daemon.profile.settings import Settings
 
-STEPS = (
-    "joints",
-    "heat",
-    "friction",
-    "latency",
-    "tare",
-    "equilibrate",
-    "curve",
-    "centre",
-    "modulus",
-    "law",
-    "relaxation",
-    "scales",
-)
-_OF_PROFILE = STEPS[: STEPS.index("tare")]  # All other steps calibrate a single tip.
+# Steps that change the profile, and steps that calibrate a single tip.
+_OF_PROFILE = ("joints", "heat", "friction", "latency")
+_OF_TIP = ("tare", "equilibrate", "curve", "centre", "modulus", "law", "relaxation", "scales")
 # Fraction of the prior standard deviation. If a sensor gain's standard deviation exceeds this
 # fraction, the gain has never been measured in a grip.
 _LEARNT = 0.8
@@ -83,7 +71,7 @@ removes the result of scales.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    parser.add_argument("step", choices=STEPS)
+    parser.add_argument("step", choices=(*_OF_PROFILE, *_OF_TIP))
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="output file, created if it does not exist"
     )

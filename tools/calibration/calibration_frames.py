@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import RecordingError, TactileError
-from softfinger.daemon.perception.calibration_file import Calibration
+from softfinger.daemon.perception.calibration_file import Calibration, Sensor
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
 from softfinger.daemon.tactile.frame_files import TRUTHS, FrameRecording, load_recording
@@ -37,21 +37,11 @@ _BEFORE = 4000  # maximum number of frames stored before a load is applied
 
 @dataclass(frozen=True)
 class Loads:
-    """Loads that were applied in a calibration step.
+    """Loads that were applied in a calibration step; the lists have one element per load."""
 
-    Attributes
-    ----------
-    frames
-        Counts, uint16 [k, rows, cols], for each load.
-    truths
-        Known values, float64 [loads], for each quantity.
-    t
-        Times of the frames [s], float64 [k], for each load.
-    """
-
-    frames: list[NDArray[np.uint16]]
-    truths: dict[str, NDArray[np.float64]]
-    t: list[NDArray[np.float64]]
+    frames: list[NDArray[np.uint16]]  # counts [k, rows, cols]
+    truths: dict[str, NDArray[np.float64]]  # known values [loads] of each quantity
+    t: list[NDArray[np.float64]]  # times of the frames [k] [s]
 
 
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
@@ -67,17 +57,8 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
         for name, unit in _UNITS.items()
         if getattr(arguments, name)
     }
-    tactile = settings.tactile
     if arguments.recording:
-        runs = [_read(path, tactile, sensor.full_count) for path in arguments.recording]
-        for path, recording in zip(arguments.recording, runs, strict=True):
-            if recording.counts.shape[1:] != (sensor.rows, sensor.cols):
-                found = " × ".join(map(str, recording.counts.shape[1:]))
-                raise RecordingError(
-                    f"{path}: found frames of {found} cells, expected {sensor.rows} × {sensor.cols}"
-                )
-            if wrong := pitch_difference(recording, sensor.pitch):
-                raise RecordingError(f"{path}: {wrong}")
+        runs = [_read(path, settings.tactile, sensor) for path in arguments.recording]
         whole = runs[0]
         if len(runs) == 1 and whole.truths and arguments.step != "relaxation":
             # If one recording contains the whole run, each frame with a contact is a separate load.
@@ -90,21 +71,30 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
             [each.counts for each in runs], _spread(given, len(runs)), [each.t for each in runs]
         )
     count = max([arguments.loads, 1, *(len(values) for values in given.values())])
-    truths = _spread(given, count)
-    frames, t = _live(arguments, settings, sensor.finger, truths, count)
-    return Loads(frames, truths, t)
+    return _live(arguments, settings, sensor.finger, _spread(given, count), count)
 
 
-def _read(path: Path, tactile: TactileSettings, full: int) -> FrameRecording:
-    """Read a recording, set saturated cells to ``full`` and print notes about defects."""
+def _read(path: Path, tactile: TactileSettings, sensor: Sensor) -> FrameRecording:
+    """Read a recording, set saturated cells to ``full_count`` and print notes about defects.
+
+    Raises RecordingError if the recording has other cells than the sensor.
+    """
     found = load_recording(
         path, tactile.pascal_per_count, tactile.rate, tactile.noise, tactile.full_count
     )
     for note in found.notes:
         to_stderr("calibrate")(f"{path}: {note}")
+    if found.counts.shape[1:] != (sensor.rows, sensor.cols):
+        cells = " × ".join(map(str, found.counts.shape[1:]))
+        raise RecordingError(
+            f"{path}: found frames of {cells} cells, expected {sensor.rows} × {sensor.cols}"
+        )
+    if wrong := pitch_difference(found, sensor.pitch):
+        raise RecordingError(f"{path}: {wrong}")
     if found.full_count is None:
         return found
-    counts = np.where(found.counts >= found.full_count, full, found.counts).astype(np.uint16)
+    saturated = found.counts >= found.full_count
+    counts = np.where(saturated, sensor.full_count, found.counts).astype(np.uint16)
     return replace(found, counts=counts)
 
 
@@ -125,8 +115,8 @@ def _live(
     finger: str,
     truths: dict[str, Any],
     count: int,
-) -> tuple[list[NDArray[np.uint16]], list[NDArray[np.float64]]]:
-    """Return the counts and the times of the frames of each load."""
+) -> Loads:
+    """Read frames from the finger's sensor while each load is applied."""
     clock = RealClock()
     loads = []
     with _opened(settings, clock, finger) as backend:
@@ -142,7 +132,8 @@ def _live(
             frames = _fresh(backend, clock)
             loads.append([next(frames) for _ in range(arguments.frames)])
     counts = [np.stack([frame.data for frame in load]) for load in loads]
-    return counts, [np.array([frame.t_sample for frame in load]) for load in loads]
+    times = [np.array([frame.t_sample for frame in load]) for load in loads]
+    return Loads(counts, truths, times)
 
 
 def _while_pressed(

@@ -124,9 +124,8 @@ class Step:
     def readings(self) -> list[FloatArray]:
         """Mean readings at each load, without the noise of cells far from the contact."""
         noise = self.calibration.tare.noise if self.calibration.tare else 0.0
-        spread = np.full(self.converter.zero.shape, noise)
         return [
-            above_zero(np.maximum(each, 0.0), spread, len(frames))
+            above_zero(np.maximum(each, 0.0), noise, len(frames))
             for each, frames in zip(self.over, self.loads.frames, strict=True)
         ]
 
