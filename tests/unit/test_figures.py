@@ -232,7 +232,7 @@ def test_checkpoints_of_the_appendix(of: Callable[..., experiment_pages.Terms]) 
     expected = (31.939525311496, 1.7671458676443, 0.098174770424681)
     np.testing.assert_allclose(of(a, d), expected, rtol=1e-13)
     assert experiment_pages.limits(a, d)[1] == pytest.approx(0.92729521800161, rel=1e-14)  # eq. 17
-    assert of(a, d).energy(a, 0.304, d) == pytest.approx(20.374275556081, rel=1e-12)
+    assert sum(of(a, d).energies(a, 0.304, d)) == pytest.approx(20.374275556081, rel=1e-12)
 
 
 @pytest.mark.extended

@@ -167,13 +167,8 @@ class Terms(NamedTuple):
     second: FloatArray  # eq. 18
     third: FloatArray  # 1/m, eq. 19
 
-    def energy(self, radius: float, modulus: float, d: FloatArray) -> FloatArray:
-        """Return U(d, 0) [J] from eq. 12."""
-        first, second, third = self.terms(radius, modulus, d)
-        return first + second + third
-
-    def terms(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
-        """Return each term's contribution [J] to the energy in eq. 12."""
+    def energies(self, radius: float, modulus: float, d: FloatArray) -> tuple[FloatArray, ...]:
+        """Return each term's contribution [J] to U(d, 0) in eq. 12."""
         h = radius - d
         factor = 0.5 * modulus * h**2
         return factor * self.first, -2.0 * h * factor * self.second, h**2 * factor * self.third
@@ -217,9 +212,10 @@ def _appendix() -> tuple[Sheet, ...]:
         ("as printed", printed_terms(TIP.radius, metres)),
         ("integrated", integrated_terms(TIP.radius, metres)),
     ):
-        for name, term in zip(_TERMS, terms.terms(TIP.radius, MODULUS, metres), strict=True):
-            columns[f"{name} term {how} [mJ]"] = 1e3 * term
-        columns[f"U {how} [mJ]"] = 1e3 * terms.energy(TIP.radius, MODULUS, metres)
+        parts = terms.energies(TIP.radius, MODULUS, metres)
+        for name, part in zip(_TERMS, parts, strict=True):
+            columns[f"{name} term {how} [mJ]"] = 1e3 * part
+        columns[f"U {how} [mJ]"] = 1e3 * (parts[0] + parts[1] + parts[2])
     theta_max, p = limits(TIP.radius, metres)
     columns |= {"theta_max [deg]": np.degrees(theta_max), "p [deg]": np.degrees(p)}
     return (Sheet("fig11", columns),)
