@@ -11,9 +11,9 @@ import pytest
 from softfinger.daemon.errors import Refused
 from softfinger.tools import cli
 from softfinger.tools.benchmarks import bench, control, estimator, faults, measuring, reflex, tick
-from softfinger.tools.benchmarks.faults import BOUNDED, SETTLES, FaultCase, GripTrial, measure
+from softfinger.tools.benchmarks.faults import BOUNDED, SETTLES, GripTrial, measure
 from softfinger.tools.benchmarks.measuring import Report, figure, interleave
-from softfinger.tools.benchmarks.rigs import RigError, Watch
+from softfinger.tools.benchmarks.rigs import GripCase, RigError, Watch
 
 
 def test_interleaved_timing(monkeypatch):
@@ -216,7 +216,7 @@ def test_a_watch_measures_forces_times_and_positions():
     ],
 )
 def test_missed_aims_are_listed(aim, changes, missed):
-    case = FaultCase("a case", aim, 6.0, "left:drift=0.2@0..2", ("left_sensor",))
+    case = GripCase("a case", 6.0, aim=aim, words="left:drift=0.2@0..2", false=("left_sensor",))
     met = GripTrial(
         ("left_sensor",), comes=2.0, settled=1.0, events=[(1.29, "consistency.left_sensor")]
     )

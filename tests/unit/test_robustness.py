@@ -13,8 +13,8 @@ from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.benchmarks.rigs import VirtualGrip, merged
-from softfinger.tools.benchmarks.robustness import ROWS, HandCase, drawn, drawn_in_mujoco, grip
+from softfinger.tools.benchmarks.rigs import GripCase, VirtualGrip, merged
+from softfinger.tools.benchmarks.robustness import ROWS, drawn, drawn_in_mujoco, grip
 
 ROW = {case.name: case for case in ROWS}
 LONG = pytest.mark.extended
@@ -64,7 +64,7 @@ def test_a_falling_zero_offset_is_named_and_the_grip_continues(name, seed):
 @pytest.mark.parametrize("delay", [0.005, 0.01, 0.02])
 @pytest.mark.parametrize("force", [6.0, pytest.param(20.0, marks=LONG)])
 def test_frames_up_to_the_default_latency_do_not_change_the_force(delay, force):
-    late = HandCase("late", force, {"simulation": {"tactile_delay": delay}})
+    late = GripCase("late", force, {"simulation": {"tactile_delay": delay}})
     found = grip(late)
     assert found.settled == pytest.approx(1.0, abs=0.1)
     assert found.accused == ()

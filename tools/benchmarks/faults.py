@@ -23,7 +23,7 @@ from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.daemon.simulation.emulator.emulator import DEFAULT_BOARD
 from softfinger.daemon.types import FINGERS
 from softfinger.tools.benchmarks.measuring import Report, Row
-from softfinger.tools.benchmarks.rigs import SOLID, Sections, VirtualGrip, diagnoses
+from softfinger.tools.benchmarks.rigs import SOLID, GripCase, Sections, VirtualGrip, diagnoses
 
 _TRIAL_COUNT = 20
 _FORCES = (6.0, 12.0)  # requested forces [N]
@@ -48,28 +48,10 @@ _SENSORS = ("left_sensor", "right_sensor")
 EIGHT_BITS: Sections = {"tactile": {**DEFAULT_BOARD, "backend": "simulated"}}
 
 
-@dataclass(frozen=True)
-class FaultCase:
-    """Benchmark case that combines a kind of grip with a fault.
-
-    ``words`` are faults in the syntax of `softfinger emulate --fault`, with ``{side}`` as a
-    placeholder for the finger. The faults start while the object is held. If ``before`` is True,
-    the faults start before the grasp.
-    """
-
-    name: str
-    aim: str
-    force: float  # requested force [N]
-    words: str = ""
-    false: tuple[str, ...] = ()  # channels that may be reported as faulty
-    before: bool = False
-    then: float = 0.0  # second requested force [N]
-    settings: Sections = field(default_factory=dict)
-
-
-def _cases(force: float) -> Iterator[FaultCase]:
-    settles = partial(FaultCase, aim=SETTLES, force=force)
-    bounded = partial(FaultCase, aim=BOUNDED, force=force)
+def _cases(force: float) -> Iterator[GripCase]:
+    """Yield the cases; ``{side}`` is a placeholder for the affected finger."""
+    settles = partial(GripCase, aim=SETTLES, force=force)
+    bounded = partial(GripCase, aim=BOUNDED, force=force)
     yield settles("no fault")
     for who, side, false in (
         ("one sensor", "{side}:", ("{side}_sensor",)),
@@ -84,7 +66,7 @@ def _cases(force: float) -> Iterator[FaultCase]:
         for drift in (0.2, -0.2):
             words = f"{side}drift={drift}@0..2"
             name = f"{who}, zero {drift:+.0%} of full scale in 2 s"
-            yield lies(name, words=words, settings=EIGHT_BITS)
+            yield lies(name, words=words, daemon=EIGHT_BITS)
         for kind, change in (
             ("shift-x=3", "shifted by 3 cells"),
             ("shift-x=-3", "shifted by -3 cells"),
@@ -98,10 +80,10 @@ def _cases(force: float) -> Iterator[FaultCase]:
         yield bounded(f"one servo's current x {scale:g} at once", words=words, false=false)
     for scale in (0.6, 0.8, 1.25, 1.6):
         odd = {"simulation": {"modulus_scale": scale}}
-        yield settles(f"E of the tips x {scale:g}", settings=odd)
-    yield settles("solid tips, no fault", settings=SOLID)
+        yield settles(f"E of the tips x {scale:g}", daemon=odd)
+    yield settles("solid tips, no fault", daemon=SOLID)
     for gain in (0.7, 1.3):
-        lies = partial(settles, words=f"gain={gain}", false=_SENSORS, settings=SOLID)
+        lies = partial(settles, words=f"gain={gain}", false=_SENSORS, daemon=SOLID)
         yield lies(f"solid tips, both sensors, gain {gain:g} from the start", before=True)
         yield lies(f"solid tips, both sensors, gain {gain:g} at once")
 
@@ -138,7 +120,7 @@ class GripTrial:
         names = diagnoses(self.events)
         return [(t, name) for t, name in names if (name in self.false) == rightly]
 
-    def missed(self, case: FaultCase) -> list[str]:
+    def missed(self, case: GripCase) -> list[str]:
         """Return the criteria that the trial did not meet."""
         low, high = _SETTLED_RANGE
         named = min((t for t, _ in self.named(True)), default=math.inf) - 0.5 * self.comes
@@ -179,17 +161,17 @@ def measure(
     return reports
 
 
-def _outcome(drawn: tuple[FaultCase, int]) -> dict[str, Any]:
+def _outcome(drawn: tuple[GripCase, int]) -> dict[str, Any]:
     return asdict(trial(*drawn))
 
 
-def trial(case: FaultCase, seed: int) -> GripTrial:
+def trial(case: GripCase, seed: int) -> GripTrial:
     """Run one trial."""
     chance = random.Random(f"{case.name} {seed}")
     side = chance.choice(FINGERS)
     found = GripTrial(tuple(name.format(side=side) for name in case.false))
     words = case.words.format(side=side)
-    with VirtualGrip.drawn(seed, chance, case.settings) as grip:
+    with VirtualGrip.drawn(seed, chance, case.daemon) as grip:
         loop, state = grip.loop, grip.state
         if case.before:
             grip.begin(words)
@@ -214,7 +196,7 @@ def trial(case: FaultCase, seed: int) -> GripTrial:
     return found
 
 
-def summary(case: FaultCase, found: Sequence[GripTrial]) -> Row:
+def summary(case: GripCase, found: Sequence[GripTrial]) -> Row:
     """Return a row with a case's force statistics, missed criteria and event times."""
     settled = [each.settled for each in found if not math.isnan(each.settled)]
     missed = [each.missed(case) for each in found]

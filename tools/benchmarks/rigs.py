@@ -11,6 +11,7 @@ import gc
 import math
 import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Self
@@ -39,6 +40,31 @@ _INCREASED_RATIO = 1.25
 _AVERAGING_TIME = 0.5  # time at the end of the hold over which the force is averaged [s]
 _SLIP_FRACTION = 0.999  # fraction of the friction limit above which a tip counts as slipping
 _EVENT_PREFIX = "consistency."  # prefix of the event kinds that report a faulty measurement
+
+
+@dataclass(frozen=True)
+class GripCase:
+    """Grip at ``force`` [N] with a faulty hand, or with a hand that differs from the settings.
+
+    ``words`` are faults in the syntax of `softfinger emulate --fault`. The faults start while the
+    object is held. If ``before`` is True, the faults start before the grasp.
+    """
+
+    name: str
+    force: float  # requested force [N]
+    # Settings that differ between the hand and the daemon.
+    hand: Sections = field(default_factory=dict)
+    daemon: Sections = field(default_factory=dict)
+    torque: float = 1.0  # ratio of the true torque constant to its setting
+    words: str = ""
+    before: bool = False
+    false: tuple[str, ...] = ()  # channels that may be reported as faulty
+    aim: str = ""  # pass criterion
+    then: float = 0.0  # second requested force [N]
+    load: float = 0.0  # load along the faces [N]
+    within: float = 0.0  # duration of the load ramp [s]
+    turn: float = 0.0  # commanded object angle [rad]
+    tares: bool = False  # True if the sensors are tared before the grip
 
 
 class RigError(SoftfingerError):

@@ -14,7 +14,7 @@ import math
 import random
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -27,6 +27,7 @@ from softfinger.tools.benchmarks.faults import EIGHT_BITS
 from softfinger.tools.benchmarks.measuring import Report
 from softfinger.tools.benchmarks.rigs import (
     SENSORS,
+    GripCase,
     Sections,
     VirtualGrip,
     diagnoses,
@@ -47,24 +48,6 @@ _LOAD_FRACTION = 0.8  # loads below this fraction of the friction limit must be 
 _LATENCY = Settings().tactile.latency
 
 
-@dataclass(frozen=True)
-class HandCase:
-    """Grip at ``force`` [N] with a hand that differs from the daemon's settings."""
-
-    name: str
-    force: float
-    # Settings that differ between the hand and the daemon.
-    hand: Sections = field(default_factory=dict)
-    daemon: Sections = field(default_factory=dict)
-    torque: float = 1.0  # ratio of the true torque constant to its setting
-    words: str = ""  # faults during the hold, in `softfinger emulate --fault` syntax
-    load: float = 0.0  # load along the faces [N]
-    within: float = 0.0  # duration of the load ramp [s]
-    turn: float = 0.0  # commanded object angle [rad]
-    tares: bool = False  # True if the sensors are tared before the grip
-    false: tuple[str, ...] = ()  # channels that may be reported as faulty
-
-
 def _hand(**simulation: Any) -> Sections:
     return {"simulation": simulation}
 
@@ -72,12 +55,12 @@ def _hand(**simulation: Any) -> Sections:
 _BOTH_SENSORS = tuple(f"{side}_sensor" for side in FINGERS)
 _RELAXATION = (0.1, 0.2, 0.2)
 ROWS = (
-    HandCase("as set", 6.0),
-    HandCase("joint friction 0.12 N·m", 6.0, _hand(joint_friction=0.12)),
-    HandCase("joint friction 0.20 N·m", 12.0, _hand(joint_friction=0.20)),
-    HandCase("stiction 0.15 N·m", 6.0, _hand(joint_stribeck=0.15)),
+    GripCase("as set", 6.0),
+    GripCase("joint friction 0.12 N·m", 6.0, _hand(joint_friction=0.12)),
+    GripCase("joint friction 0.20 N·m", 12.0, _hand(joint_friction=0.20)),
+    GripCase("stiction 0.15 N·m", 6.0, _hand(joint_stribeck=0.15)),
     *(
-        HandCase(
+        GripCase(
             f"zero {drift:+.0%} in {s} s{of}",
             6.0,
             daemon=board,
@@ -88,19 +71,19 @@ ROWS = (
         for drift, s in ((-0.05, 20), (-0.02, 20), (0.05, 20), (-0.05, 120))
     ),
     *(
-        HandCase(f"frames {ms} ms older", force, _hand(tactile_delay=_LATENCY + 1e-3 * ms))
+        GripCase(f"frames {ms} ms older", force, _hand(tactile_delay=_LATENCY + 1e-3 * ms))
         for ms, force in ((15, 12.0), (30, 6.0), (10, 20.0))
     ),
-    HandCase("rubber that relaxes", 6.0, _hand(tip_relaxation=_RELAXATION)),
-    HandCase("cells of 80 ms", 6.0, _hand(tactile_response=0.08)),
-    HandCase("both of these", 6.0, _hand(tip_relaxation=_RELAXATION, tactile_response=0.08)),
-    HandCase(
+    GripCase("rubber that relaxes", 6.0, _hand(tip_relaxation=_RELAXATION)),
+    GripCase("cells of 80 ms", 6.0, _hand(tactile_response=0.08)),
+    GripCase("both of these", 6.0, _hand(tip_relaxation=_RELAXATION, tactile_response=0.08)),
+    GripCase(
         "both gains and currents halve in 5 s",
         6.0,
         words="gain=0.5@0..5 left:current=0.5@0..5 right:current=0.5@0..5",
         false=(*_BOTH_SENSORS, "left_current", "right_current"),
     ),
-    HandCase(
+    GripCase(
         "both images wander by 6 cells in 60 s", 6.0, words="shift-x=6@0..60", false=_BOTH_SENSORS
     ),
 )
@@ -118,7 +101,7 @@ NAMES = (
 )
 
 
-def drawn(seed: int) -> HandCase:
+def drawn(seed: int) -> GripCase:
     """Create a random hand for the ensemble; all its parameters differ from the settings."""
     chance = random.Random(f"{_ENSEMBLE}{seed}")
 
@@ -157,7 +140,7 @@ def drawn(seed: int) -> HandCase:
     words = " ".join(f"{side}:drift={drift:.4f}@0..{over:.1f}" for side, drift in drifts.items())
     off = (abs(math.log(gain)) > _GAIN_ERROR_MIN for gain in gains)
     pushed, turned = chance.random() < 0.5, chance.random() < 0.5
-    return HandCase(
+    return GripCase(
         f"{_ENSEMBLE}{seed}",
         force,
         hand,
@@ -181,7 +164,7 @@ def drawn(seed: int) -> HandCase:
     )
 
 
-def drawn_in_mujoco(seed: int) -> HandCase:
+def drawn_in_mujoco(seed: int) -> GripCase:
     """Create the same hand as `drawn` in MuJoCo, without stiction and relaxation."""
     case = drawn(seed)
     mujoco: Sections = {"servos": {"backend": "mujoco"}, "plugins": {"mujoco": {"timestep": 1e-3}}}
@@ -196,7 +179,7 @@ def drawn_in_mujoco(seed: int) -> HandCase:
     return replace(case, name=f"{_MUJOCO}{seed}", hand=hand, daemon=daemon, torque=1.0)
 
 
-def sensor_grips(sensor: str) -> Iterator[HandCase]:
+def sensor_grips(sensor: str) -> Iterator[GripCase]:
     """Yield grips of 4, 8 and 12 N with a sensor; the object is rotated by ±8°."""
     for k in range(1, _SENSOR_COUNT + 1):
         name = f"{sensor} {k}"
@@ -206,7 +189,7 @@ def sensor_grips(sensor: str) -> Iterator[HandCase]:
         torque = chance.uniform(0.9, 1.1)
         hand, turn = _hand(seed=k, object_mass=mass), math.copysign(_TURN, k % 2 - 0.5)
         daemon = SENSORS.get(sensor, {})
-        yield HandCase(name, force, hand, daemon, torque, turn=turn, tares=True)
+        yield GripCase(name, force, hand, daemon, torque, turn=turn, tares=True)
 
 
 @dataclass
@@ -234,7 +217,7 @@ class Outcome:
         return near or (self.first_off < math.inf and is_reported)
 
 
-def grip(case: HandCase, seed: int = 1) -> Outcome:
+def grip(case: GripCase, seed: int = 1) -> Outcome:
     """Run one grip; ``seed`` determines the noise and the random delays."""
     chance, found = random.Random(f"{case.name} {seed}"), Outcome()
     daemon = merged({"simulation": {"seed": seed}}, case.daemon)
@@ -277,7 +260,7 @@ def grip(case: HandCase, seed: int = 1) -> Outcome:
     return found
 
 
-def _outcome(drawn_case: tuple[HandCase, int]) -> dict[str, Any]:
+def _outcome(drawn_case: tuple[GripCase, int]) -> dict[str, Any]:
     return asdict(grip(*drawn_case))
 
 
@@ -335,7 +318,7 @@ def _sensor_row(sensor: str, found: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _row(case: HandCase, found: list[Outcome]) -> dict[str, Any]:
+def _row(case: GripCase, found: list[Outcome]) -> dict[str, Any]:
     settled = sorted(each.settled for each in found if not math.isnan(each.settled))
     well = sum(each.well() for each in found)
     print(f"{case.name}: {well} of {len(found)}", file=sys.stderr, flush=True)
@@ -354,7 +337,7 @@ def _row(case: HandCase, found: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def _ensemble(title: str, hands: list[HandCase], found: list[Outcome]) -> Report:
+def _ensemble(title: str, hands: list[GripCase], found: list[Outcome]) -> Report:
     count = len(found)
 
     def share(what: str, aim: str, number: int, of: int = count) -> dict[str, Any]:

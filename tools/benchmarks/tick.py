@@ -213,12 +213,11 @@ class CannedServos:
         self._current = reading.current.copy()
 
     def close(self) -> None:
-        """Do nothing."""
+        pass
 
     connect = torque_on = close
 
     def counters(self) -> dict[str, int]:
-        """Return an empty dictionary."""
         return {}
 
     def read(self, reading: Reading) -> None:
@@ -235,7 +234,7 @@ class CannedServos:
         return True
 
     def write(self, goal: Goal) -> None:
-        """Ignore the goal."""
+        pass
 
 
 class CannedSensor(GivenFrames):
@@ -250,7 +249,6 @@ class CannedSensor(GivenFrames):
         self._last = Frame(1, clock.now(), clock.now(), True, counts[0])
 
     def latest(self) -> Frame:
-        """Return the current frame."""
         now = self._clock.now()
         if now - self._last.t_arrival >= self._period:
             seq = self._last.seq + 1
