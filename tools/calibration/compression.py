@@ -29,10 +29,10 @@ from softfinger.kinematics.calibration.compression_fit import (
     loading,
     rising,
 )
+from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.tools.calibration.calibration_plot import Panel, Points
-from softfinger.tools.calibration.steps import tip_name, tip_settings
 
 FloatArray = NDArray[np.float64]
 
@@ -263,6 +263,21 @@ def _with_law(calibration: Calibration, step: ModulusStep, wants: dict[str, Any]
 
 def _is_constant(fit: CompressionFit) -> bool:
     return len(fit.factors) == 1 and fit.law.is_linear
+
+
+def tip_name(tip: Fingertip, law: Material) -> str:
+    """Return the name of a tip model in the summary lines."""
+    if tip.physics == "solid":
+        return f"solid, {tip.base}, {tip.face}, ν {tip.poisson:.3f}"
+    return "springs" if law.is_linear else f"springs, law {law.name}"
+
+
+def tip_settings(tip: Fingertip) -> dict[str, str | float]:
+    """Return the ``[tip]`` settings of a tip model."""
+    if tip.physics != "solid":
+        return {"physics": tip.physics}
+    poisson = round(tip.poisson, 3)
+    return {"physics": "solid", "base": tip.base, "face": tip.face, "poisson": poisson}
 
 
 def _name(fit: CompressionFit) -> str:

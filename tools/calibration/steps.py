@@ -59,6 +59,7 @@ from softfinger.kinematics.estimation.measured import MeasuredEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.calibration.calibration_frames import Loads
 from softfinger.tools.calibration.calibration_plot import Map, Panel, Points
+from softfinger.tools.calibration.compression import tip_name, tip_settings
 
 FloatArray = NDArray[np.float64]
 _UNDONE: dict[str, Any] = {"modulus": None, "law": None, "scales": None, "wants": {}}
@@ -137,8 +138,7 @@ class Step:
     @property
     def cell_area(self) -> float:
         """Cell area [m²]."""
-        x, y = self.calibration.sensor.pitch
-        return x * y
+        return math.prod(self.calibration.sensor.pitch)
 
     @property
     def plain_grid(self) -> SensorGrid:
@@ -306,7 +306,22 @@ def _law(step: Step) -> Done:
             "law: found a modulus of at most 0 for each tip model, expected forces that increase "
             "with d; check the presses and their d"
         )
-    best, lines = fits[0], [_told(each) for each in fits]
+    best = fits[0]
+    lines = [_told(best)]
+    softer = first_cycle(d, theta, signed.sum(axis=(1, 2)))
+    if softer is not None:
+        lines.append(
+            f"the readings of the first presses differ by {softer:+.1%} from the readings of later "
+            "presses of equal depth"
+        )
+        if softer > _SOFTENS:
+            lines[-1] += (
+                ": the rubber softens; press the tip several times to the full depth, then "
+                "calibrate again"
+            )
+    if best.trend is not None:
+        lines.append(_over_d(best.trend))
+    lines += [_told(each) for each in fits[1:]]
     steps: dict[str, Any] = {"scales": None}
     wants = tip_settings(best.tip)
     if best.valid > 0.0:
@@ -328,20 +343,6 @@ def _law(step: Step) -> Done:
                 f"{error}"
             ) from None
         lines.append(f"measured: could not fit curves: {error}")
-    if best.trend is not None:
-        lines.insert(1, _over_d(best.trend))
-    softer = first_cycle(d, theta, signed.sum(axis=(1, 2)))
-    if softer is not None:
-        lines.insert(
-            1,
-            f"the readings of the first presses differ by {softer:+.1%} from the readings of later "
-            "presses of equal depth",
-        )
-        if softer > _SOFTENS:
-            lines[1] += (
-                ": the rubber softens; press the tip several times to the full depth, then "
-                "calibrate again"
-            )
     told = (f"tip.{name} = {json.dumps(value)}" for name, value in wants.items())
     lines.append(f"for the profile: {', '.join(told)}")
     return step.result(**steps, wants=wants), "\n  ".join(lines), ()
@@ -402,21 +403,6 @@ def _over_d(trend: Trend) -> str:
     if not trend.drifts:
         return told
     return f"{told}: drifts by {trend.drift:+.0%} ± {trend.std:.1%}, so {trend.cause}"
-
-
-def tip_name(tip: Fingertip, law: Material) -> str:
-    """Return the name of a tip model in the summary lines."""
-    if tip.physics == "solid":
-        return f"solid, {tip.base}, {tip.face}, ν {tip.poisson:.3f}"
-    return "springs" if law.is_linear else f"springs, law {law.name}"
-
-
-def tip_settings(tip: Fingertip) -> dict[str, str | float]:
-    """Return the ``[tip]`` settings of a tip model."""
-    if tip.physics != "solid":
-        return {"physics": tip.physics}
-    poisson = round(tip.poisson, 3)
-    return {"physics": "solid", "base": tip.base, "face": tip.face, "poisson": poisson}
 
 
 def _told(fit: TipFit) -> str:
