@@ -48,20 +48,14 @@ class CalibrationError(SoftfingerError, ValueError):
 
 @dataclass(frozen=True)
 class Tare:
-    """Result of `tare`: zero offset and noise of the cells.
+    """Result of `tare`; ``correlation`` is empty if no correlation is significant."""
 
-    ``zero`` and ``noise`` are the mean and the standard deviation of the unloaded counts, both
-    float64 [rows, cols]. Element [k, m] of ``correlation`` is the noise correlation of two cells
-    that are k rows and m columns apart. ``correlation`` is empty if no correlation is significant.
-    ``drift`` [counts] is the standard deviation of a drift that is common to all cells. ``excess``
-    [counts] is the mean of max(reading − zero, 0).
-    """
-
-    zero: FloatArray
-    noise: FloatArray
+    zero: FloatArray  # mean of the unloaded counts [rows, cols]
+    noise: FloatArray  # standard deviation of the unloaded counts [rows, cols]
+    # Element [k, m] is the noise correlation of two cells that are k rows and m columns apart.
     correlation: FloatArray
-    drift: float
-    excess: float
+    drift: float  # standard deviation of a drift that is common to all cells [counts]
+    excess: float  # mean of max(reading − zero, 0) [counts]
 
 
 def tare(frames: ArrayLike) -> Tare:
@@ -139,16 +133,11 @@ def _lagged_products(stack: FloatArray | NDArray[np.bool_], lags: int) -> FloatA
 
 @dataclass(frozen=True)
 class Equilibration:
-    """Result of `equilibrate`: cell gains.
+    """Result of `equilibrate`: gains that equalise the response of all cells."""
 
-    ``gain`` float64 [rows, cols] equalises the response of all cells; it is 0 for dead cells.
-    ``spread`` is the relative rms deviation of the cells from their mean before equilibration.
-    ``residual`` is the relative rms deviation after equilibration.
-    """
-
-    gain: FloatArray
-    spread: float
-    residual: float
+    gain: FloatArray  # [rows, cols]; 0 for dead cells
+    spread: float  # relative rms deviation of the cells from their mean, without the gains
+    residual: float  # the same deviation, with the gains
 
 
 def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
@@ -184,16 +173,12 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
 @dataclass(frozen=True)
 class SensorCurve:
-    """Result of `fit_curve`: the pressure p = c_1 x^b + c_2 x² + c_3 x³ [Pa].
-
-    ``coefficients`` are (b, c_1, c_2, c_3). ``errors`` [n] are the relative errors at the known
-    forces, and ``residual`` is their rms.
-    """
+    """Result of `fit_curve`: the pressure p = c_1 x^b + c_2 x² + c_3 x³ [Pa]."""
 
     kind: Kind
-    coefficients: tuple[float, float, float, float]
-    errors: FloatArray
-    residual: float
+    coefficients: tuple[float, float, float, float]  # b, c_1, c_2, c_3
+    errors: FloatArray  # relative errors at the known forces [n]
+    residual: float  # rms of the errors
 
 
 def fit_curve(
@@ -337,15 +322,11 @@ def without_clipping(means: FloatArray, zero: FloatArray, noise: float) -> Float
 
 @dataclass(frozen=True, eq=False)
 class Relaxation:
-    """Result of `fit_relaxation`: F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i.
+    """Result of `fit_relaxation`: F = c F∞ (1 + Σ r_i (1 − h_i/F∞)), ḣ_i = (F∞ − h_i)/τ_i."""
 
-    The strengths are r_i. ``residual`` is the rms relative error of F during the hold. ``elastic``
-    is the same error for a fit without relaxation.
-    """
-
-    strengths: tuple[float, ...]
-    residual: float
-    elastic: float
+    strengths: tuple[float, ...]  # r_i
+    residual: float  # rms relative error of F during the hold
+    elastic: float  # the same error for a fit without relaxation
     model: FloatArray  # F [N], measured during the press and fitted during the hold
 
 

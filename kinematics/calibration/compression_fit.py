@@ -50,19 +50,14 @@ _POWERS: tuple[tuple[Fraction, ...], ...] = ((), (Fraction(1),), (Fraction(0), F
 
 @dataclass(frozen=True)
 class Run:
-    """Loading branch of one compression at a fixed tilt.
+    """Loading branch of one compression at a fixed tilt; d and F have unknown zero offsets."""
 
-    ``theta`` is in rad. ``d`` [n] [m] and ``force`` [n] [N] have unknown zero offsets. ``begin``
-    [m] is the value of d at which the curve begins. ``dropped`` is the number of rows that belong
-    to other branches.
-    """
-
-    theta: float
-    d: FloatArray
-    force: FloatArray
-    begin: float
-    cycles: int
-    dropped: int
+    theta: float  # rad
+    d: FloatArray  # [n] [m]
+    force: FloatArray  # [n] [N]
+    begin: float  # value of d at which the curve begins [m]
+    cycles: int  # number of branches that reach the full depth
+    dropped: int  # number of rows in other branches
 
     @property
     def depth(self) -> float:
@@ -204,23 +199,20 @@ def _begin(d: FloatArray, force: FloatArray) -> float:
 class CompressionFit:
     """Fit of one material law to runs of a testing machine.
 
-    If k > 1, ``factors`` [k] [Pa] are the coefficients of the powers 1 to k of the strain. If k =
-    1, the single factor multiplies the shape ``law``. ``std`` is the maximum relative standard
-    deviation of the force where d exceeds a quarter of its maximum. For k = 1, ``std`` is also the
-    relative standard deviation of the modulus. Each row of ``zeros`` contains a run's zero offsets
-    of d [m] and F [N], and their standard deviations. ``residual`` [N] is the rms residual.
-    ``chi2`` is the squared ratio of ``residual`` to the scatter about a smooth curve. ``score`` is
-    the Bayesian information criterion; the best law has the lowest score.
+    If k > 1, ``factors`` are the coefficients of the powers 1 to k of the strain. If k = 1, the
+    single factor multiplies the shape ``law``, and ``std`` also applies to the modulus.
     """
 
     tip: Fingertip
     law: Material
-    factors: FloatArray
+    factors: FloatArray  # [k] [Pa]
+    # Maximum relative standard deviation of the force where d exceeds a quarter of its maximum.
     std: float
+    # Zero offsets of d [m] and F [N] in each run, and their standard deviations [runs, 4].
     zeros: FloatArray
-    residual: float
-    chi2: float
-    score: float
+    residual: float  # rms residual [N]
+    chi2: float  # squared ratio of the residual to the scatter about a smooth curve
+    score: float  # Bayesian information criterion; the best law has the lowest score
 
     @property
     def modulus(self) -> float:

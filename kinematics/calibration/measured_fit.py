@@ -25,21 +25,16 @@ _STAGE_ERROR = 2e-3  # assumed relative error of the test stage and its force se
 
 @dataclass(frozen=True)
 class PressSums:
-    """Presses at known d [n] [m] and θ [n] [rad], with tilts in the finger's plane.
+    """Presses at known d and θ, with tilts in the finger's plane."""
 
-    ``frames`` contains the frames [k, rows, cols] [Pa] of each press, processed as in the daemon.
-    ``pressures`` [n, rows, cols] are the mean frames without the bias of noise that is clipped at
-    zero. ``rest`` [rows, cols] is the bias of a tip without contact. ``gain`` is the ratio of the
-    true force to the sensor's force.
-    """
-
-    d: FloatArray
-    theta: FloatArray
-    frames: Sequence[FloatArray]
+    d: FloatArray  # [n] [m]
+    theta: FloatArray  # [n] [rad]
+    frames: Sequence[FloatArray]  # frames of each press [k, rows, cols] [Pa], as in the daemon
+    # Mean frames without the bias of noise that is clipped at zero [n, rows, cols] [Pa].
     pressures: FloatArray
-    rest: FloatArray
-    active: NDArray[np.bool_]
-    gain: float = 1.0
+    rest: FloatArray  # bias of a tip without contact [rows, cols] [Pa]
+    active: NDArray[np.bool_]  # False for dead cells [rows, cols]
+    gain: float = 1.0  # ratio of the true force to the sensor's force
 
 
 def fit_measured(presses: PressSums, radius: float, grid: SensorGrid) -> TipCurves:

@@ -42,18 +42,13 @@ _DRIFT_MIN = 0.02  # smallest significant drift of E, limited by the errors of p
 
 @dataclass(frozen=True)
 class Presses:
-    """Frames of presses at known d and θ.
+    """Frames of presses at known d and θ, with tilts in the finger's plane."""
 
-    ``frames`` are float64 [n, rows, cols] [Pa], at the displacements ``d`` [n] [m]. The tilts
-    ``theta`` [n] [rad] are in the finger's plane. ``noise`` [Pa] is the standard deviation of a
-    cell in these frames. ``used`` [n, rows, cols] excludes dead and saturated cells.
-    """
-
-    frames: FloatArray
-    d: FloatArray
-    theta: FloatArray
-    noise: float
-    used: NDArray[np.bool_]
+    frames: FloatArray  # [n, rows, cols] [Pa]
+    d: FloatArray  # [n] [m]
+    theta: FloatArray  # [n] [rad]
+    noise: float  # standard deviation of a cell in these frames [Pa]
+    used: NDArray[np.bool_]  # [n, rows, cols]; False for dead and saturated cells
 
     def of(
         self, tip: Fingertip, grid: SensorGrid, d: FloatArray, law: Material = _UNIT_MATERIAL
@@ -68,18 +63,16 @@ class Presses:
 
 @dataclass(frozen=True)
 class Trend:
-    """Modulus E [n] [Pa] of each press at d [n] [m], and the drift of E with d.
+    """Modulus E of each press, and the drift of E with d.
 
-    A line is fitted to E as a function of d. ``drift`` is the relative change of the line from the
-    minimum to the maximum d. ``std`` is the standard deviation of ``drift``, based on the scatter
-    about the line. ``physics`` is the physics of the fitted tip.
+    The drift is the relative change of a line, fitted to E(d), from the minimum to the maximum d.
     """
 
-    d: FloatArray
-    modulus: FloatArray
+    d: FloatArray  # [n] [m]
+    modulus: FloatArray  # E [n] [Pa]
     drift: float
-    std: float
-    physics: str
+    std: float  # standard deviation of the drift, based on the scatter about the line
+    physics: str  # physics of the fitted tip
 
     @property
     def drifts(self) -> bool:
@@ -127,25 +120,20 @@ def first_cycle(d: FloatArray, theta: FloatArray, force: FloatArray) -> float | 
 class TipFit:
     """Result of fitting one tip model to the presses.
 
-    ``law`` is the material law for a modulus of 1 Pa at zero strain. The fit determines ``modulus``
-    [Pa], ``offset`` [m] (the zero offset of d) and, for a solid tip, ν. ``chi2`` is the mean
-    squared residual per cell divided by the noise variance. ``d_error`` [m] and ``theta_error``
-    [rad] are the estimator's rms errors for this tip. ``force_error`` is the relative rms
-    difference between the estimated force and the frame sum. These errors include only frames with
-    a valid estimate. ``valid`` is the fraction of such frames. ``trend`` contains the value of E
-    for each press.
+    The errors are those of the estimator for this tip. They include only frames with a valid
+    estimate. For a solid tip, the fit also determines ν.
     """
 
     tip: Fingertip
-    modulus: float
-    offset: float
-    chi2: float
-    d_error: float = math.nan
-    theta_error: float = math.nan
-    force_error: float = math.nan
-    trend: Trend | None = None
-    valid: float = 0.0
-    law: Material = _UNIT_MATERIAL
+    modulus: float  # Pa
+    offset: float  # zero offset of d [m]
+    chi2: float  # mean squared residual per cell, divided by the noise variance
+    d_error: float = math.nan  # rms error of d [m]
+    theta_error: float = math.nan  # rms error of the tilt [rad]
+    force_error: float = math.nan  # relative rms difference of estimated force and frame sum
+    trend: Trend | None = None  # E of each press
+    valid: float = 0.0  # fraction of frames with a valid estimate
+    law: Material = _UNIT_MATERIAL  # material law for a modulus of 1 Pa at zero strain
 
     @property
     def material(self) -> Material:
@@ -258,17 +246,13 @@ def _with_errors(
 
 @dataclass(frozen=True)
 class Modulus:
-    """Result of `fit_modulus` for the model F(d − d₀, θ).
+    """Result of `fit_modulus` for the model F(d − d₀, θ)."""
 
-    ``modulus`` is E [Pa], and ``offset`` is d₀ [m]. ``errors`` [n] are the relative force errors.
-    ``trend`` contains the value of E at each load.
-    """
-
-    modulus: float
-    offset: float
-    errors: FloatArray
-    residual: float
-    trend: Trend
+    modulus: float  # E [Pa]
+    offset: float  # d₀ [m]
+    errors: FloatArray  # relative force errors [n]
+    residual: float  # rms of the errors
+    trend: Trend  # E at each load
 
 
 def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip) -> Modulus:
@@ -309,16 +293,12 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
 
 @dataclass(frozen=True)
 class Centre:
-    """Result of `fit_centre`: the tip centre in sensor axes [m] and the rotation [rad].
+    """Result of `fit_centre`: position of the tip in sensor axes."""
 
-    ``rotation`` is None if no press was tilted. ``residual`` [m] is the change in the centre during
-    the last iteration. ``std`` [m] is the standard deviation of each coordinate of the centre.
-    """
-
-    centre: tuple[float, float]
-    rotation: float | None
-    residual: float
-    std: float
+    centre: tuple[float, float]  # m
+    rotation: float | None  # rotation of the sensor [rad]; None if no press was tilted
+    residual: float  # change in the centre during the last iteration [m]
+    std: float  # standard deviation of each coordinate of the centre [m]
 
 
 def fit_centre(
