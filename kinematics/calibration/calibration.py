@@ -191,8 +191,6 @@ def fit_curve(
 
     Parameters
     ----------
-    kind
-        "power" or "cubic".
     readings
         x = (counts − zero)·gain, float64 [n, rows, cols]. The readings must be non-negative and
         free of noise far from the contact, see :func:`above_zero`.

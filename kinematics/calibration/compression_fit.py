@@ -240,22 +240,10 @@ def _power_law(factors: FloatArray, strain: ArrayLike, derivative: int = 0) -> F
 def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -> CompressionFit:
     """Fit a law, and the zero offsets of d and F in each run, by least squares.
 
-    The standard deviations account for correlated residuals.
-
-    Parameters
-    ----------
-    runs
-        Loading branches.
-    tip
-        Fingertip with its radius and physics.
-    law
-        Shape of the stress-strain law for a modulus of 1 Pa. None selects springs with the law σ =
-        c_1 ε + c_2 ε² + c_3 ε³, i.e. a strain-dependent modulus.
-
-    Raises
-    ------
-    CalibrationError
-        If the runs are too deep for the law or contradict the law.
+    ``law`` is the shape of the stress-strain law for a modulus of 1 Pa. None selects springs with
+    the law σ = c_1 ε + c_2 ε² + c_3 ε³, i.e. a strain-dependent modulus. The standard deviations
+    account for correlated residuals. Raises CalibrationError if the runs are too deep for the law
+    or contradict the law.
     """
     tables, deepest = _tables(tip, law), max(run.depth for run in runs)
     end = _end(tables[0], tip, max(abs(run.theta) for run in runs))

@@ -127,13 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run one step.
-
-    Raises
-    ------
-    SoftfingerError, OSError
-        If the step fails; the file is then unchanged.
-    """
+    """Run one step. Raises SoftfingerError or OSError; the file is then unchanged."""
     step = arguments.step
     if arguments.compression and step != "law":
         from softfinger.kinematics.calibration.calibration import CalibrationError
@@ -206,13 +200,8 @@ def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:
     roughly. Gain and modulus are estimated during a grip (`daemon.perception.hand_state`). A daemon
     that starts with the stored factors reaches the correct force in its first grip.
 
-    Raises
-    ------
-    CalibrationError
-        If the factors have not been measured in a grip.
-    NoStream
-        If there is no daemon.
-    CalibrationFileError
+    Raises CalibrationFileError, NoStream if there is no daemon, or CalibrationError if the factors
+    have not been measured in a grip.
     """
     from softfinger.daemon.perception.calibration_file import ScalesStep, now, save_calibration
     from softfinger.kinematics.calibration.calibration import CalibrationError

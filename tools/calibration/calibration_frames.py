@@ -45,12 +45,7 @@ class Loads:
 
 
 def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calibration) -> Loads:
-    """Collect the loads for a calibration step.
-
-    Raises
-    ------
-    TactileError, RecordingError, CalibrationError
-    """
+    """Collect the loads of a step. Raises TactileError, RecordingError or CalibrationError."""
     sensor = calibration.sensor
     given = {
         name: np.array(getattr(arguments, name)) * unit

@@ -85,13 +85,7 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
     The separator is a tab, a semicolon or a comma; files with decimal commas must use a tab or a
     semicolon. The unit of a column follows the column name, or is in a separate row below the
     header. Other columns, empty lines and lines that begin with # are ignored. A cell must not
-    contain a line break.
-
-    Raises
-    ------
-    CalibrationError
-        The message names the line or column.
-    OSError
+    contain a line break. Raises OSError, or CalibrationError with the line or column.
     """
     try:
         text = read_file(path).decode("utf-8-sig")
@@ -158,24 +152,10 @@ def _is_number(cell: str) -> bool:
 def fit_files(
     calibration: Calibration, settings: Settings, paths: list[Path], theta: list[float]
 ) -> tuple[Calibration, str, tuple[Panel, ...]]:
-    """Fit the material law to test data, using the tip model selected by `tip.physics`.
+    """Fit the material law to a testing machine's files, for the tip model of `tip.physics`.
 
-    Parameters
-    ----------
-    calibration, settings
-        The tip's calibration, and the profile.
-    paths
-        Files from the testing machine.
-    theta
-        Tilt of each file [deg], or an empty list.
-
-    Returns
-    -------
-    The new calibration, the summary lines, and the panels of the plot.
-
-    Raises
-    ------
-    CalibrationError, OSError
+    ``theta`` contains the tilt of each file [deg], or is empty. Returns the new calibration, the
+    summary lines and the panels of the plot. Raises CalibrationError or OSError.
     """
     if settings.tip.physics == "measured":
         raise CalibrationError(

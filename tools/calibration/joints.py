@@ -45,10 +45,7 @@ _Counts = dict[int, int]  # The keys are servo IDs.
 def calibrate_joints(arguments: argparse.Namespace, settings: Settings) -> str:
     """Guide the user through each finger's poses, write the profile and return a summary.
 
-    Raises
-    ------
-    ServoError, CalibrationError, SettingsError
-        If the procedure fails; the profile is then unchanged.
+    Raises ServoError, CalibrationError or SettingsError; the profile is then unchanged.
     """
     servos = settings.servos
     if servos.backend != "dynamixel":
@@ -142,11 +139,8 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
 def calibrate_heat(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write the thermal constants to the profile and return a summary.
 
-    Raises
-    ------
-    CalibrationError
-        If there is no recording, or the hold is too short.
-    RecordingError, SettingsError
+    Raises RecordingError, SettingsError, or CalibrationError if there is no recording or the hold
+    is too short.
     """
     if len(arguments.recording) != 1:
         raise CalibrationError(

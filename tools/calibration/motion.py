@@ -162,13 +162,8 @@ _SEEN = 2.0
 def calibrate_friction(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write the joint friction to the profile and return a summary.
 
-    Errors raised by `live_hand` are propagated.
-
-    Raises
-    ------
-    CalibrationError
-        If there is too little motion, or a tip touches something.
-    RecordingError, SettingsError
+    Raises RecordingError, SettingsError, the errors of `live_hand`, or CalibrationError if there is
+    too little motion or a tip touches something.
     """
     unit = by_name(settings.servos.model).current_unit * settings.control.torque_constant
     if not unit:
@@ -302,13 +297,8 @@ _SHAPE_ERROR, _HEIGHT_ERROR = 0.05, 0.2
 def calibrate_latency(arguments: argparse.Namespace, settings: Settings) -> str:
     """Write the frame latency to the profile and return a summary.
 
-    Errors raised by `live_hand` are propagated.
-
-    Raises
-    ------
-    CalibrationError
-        If the data do not determine the latency.
-    RecordingError, SettingsError
+    Raises RecordingError, SettingsError, the errors of `live_hand`, or CalibrationError if the data
+    do not determine the latency.
     """
     source = _source(arguments, settings, _gripped)
     own, _ = recorded_settings(source)

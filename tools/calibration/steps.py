@@ -351,14 +351,8 @@ def _law(step: Step) -> Done:
 def _measured(step: Step, pressures: FloatArray) -> tuple[TipCurves, FloatArray]:
     """Fit the tip's measured curves to the loads with the mean ``pressures`` [n, rows, cols] [Pa].
 
-    Returns
-    -------
-    The curves, and the RMS residuals of d [m], θ [rad] and F. The residual of F is relative to the
-    RMS of F. Each load contributes the mean over its frames.
-
-    Raises
-    ------
-    CalibrationError
+    Returns the curves, and the RMS residuals of d [m], θ [rad] and F. The residual of F is relative
+    to the RMS of F. Each load contributes the mean over its frames. Raises CalibrationError.
     """
     d, theta, converter, tare = step.d, step.theta, step.converter, step.calibration.tare
     if step.saturated.any():
