@@ -17,7 +17,6 @@ __all__ = [
     "HandClosed",
     "HandFault",
     "KeyFileError",
-    "NoDescriptor",
     "NoStream",
     "NotInTime",
     "PluginError",
@@ -58,13 +57,6 @@ class AddressError(SoftfingerError):
 
 class KeyFileError(SoftfingerError):
     """Failure to create or read keys. The message names the file and the remedy."""
-
-
-class NoDescriptor(KeyFileError):
-    """Failure to read keys because too many files are open.
-
-    The keys themselves may be valid.
-    """
 
 
 class ServoError(SoftfingerError):

@@ -7,10 +7,13 @@ a link at the output path. Writing through a link would overwrite the target of 
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import socket
 import stat
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Literal, TextIO
 
@@ -21,6 +24,7 @@ from softfinger.kinematics.compiled.own_folder import (
     user_cache,
 )
 
+IN_USE = "is in use; is another softfinger running?"
 SIZE_MAX = 16 << 20  # maximum size of a file read in one piece, or of one unpacked part [bytes]
 
 
@@ -68,13 +72,13 @@ def runtime_folder() -> Path:
     for folder in (Path(named), Path(f"/run/user/{os.geteuid()}")):
         if folder.is_absolute() and os.access(folder, os.W_OK | os.X_OK):
             return folder / "softfinger"
-    shared = shared_folder()
+    shared = _shared_folder()
     try:
         require_own(shared)
     except FileNotFoundError:
         return shared
     except OSError:
-        return home_folder()
+        return _home_folder()
     return shared
 
 
@@ -89,20 +93,45 @@ def runtime_fault() -> str:
     return ""
 
 
-def shared_folder() -> Path:
-    """Return the path of the user's folder in the temporary folder.
+def socket_folders() -> Iterator[Path]:
+    """Yield candidate folders for the user's sockets; another user may own any of them.
 
-    The folder may belong to another user.
+    The folders of the login session and the service come first. The parent folders exist.
     """
+    session = f"/run/user/{os.geteuid()}"
+    for place in (os.environ.get("XDG_RUNTIME_DIR"), "/run/softfinger", session):
+        if place:
+            yield Path(place, "softfinger")
+    yield _shared_folder()
+    with contextlib.suppress(RuntimeError, OSError):  # The user has no home folder.
+        user_cache().mkdir(parents=True, exist_ok=True)
+        yield _home_folder()
+
+
+def _shared_folder() -> Path:
     return Path(tempfile.gettempdir()) / f"softfinger-{os.geteuid()}"
 
 
-def home_folder() -> Path:
-    """Return the fallback folder in the user's home folder.
-
-    Raises RuntimeError if there is no home folder.
-    """
+def _home_folder() -> Path:
     return user_cache() / "run"
+
+
+def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
+    """Remove a killed process's socket file; if ``path`` is still occupied, return the reason."""
+    if not path.exists():
+        return ""
+    if not path.is_socket():
+        return "exists but is not a socket"
+    with socket.socket(socket.AF_UNIX, kind) as trial:
+        trial.setblocking(False)
+        try:
+            trial.connect(str(path))
+        except (FileNotFoundError, ConnectionRefusedError):
+            path.unlink(missing_ok=True)
+            return ""
+        except OSError:  # The socket's queue is full, or this user lacks permission.
+            pass
+    return IN_USE
 
 
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:

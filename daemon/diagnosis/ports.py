@@ -15,12 +15,11 @@ from serial.tools import list_ports
 from softfinger.daemon.client.command_client import NoAnswer, send
 from softfinger.daemon.errors import AddressError, KeyFileError
 from softfinger.daemon.gateway.endpoints import bind
-from softfinger.daemon.own_files import runtime_fault, runtime_folder
+from softfinger.daemon.own_files import IN_USE, runtime_fault, runtime_folder
 from softfinger.daemon.port_access import grant, port_group_remedy
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.wire.keys import load_client
-from softfinger.daemon.wire.local_stop import IN_USE
 
 _PROC = Path("/proc")
 

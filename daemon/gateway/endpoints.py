@@ -18,10 +18,10 @@ from typing import Any
 import zmq
 import zmq.utils.z85
 
-from softfinger.daemon.errors import AddressError, KeyFileError, NoDescriptor
+from softfinger.daemon.errors import AddressError
 from softfinger.daemon.gateway import bounds
+from softfinger.daemon.own_files import IN_USE, free_socket_path
 from softfinger.daemon.wire.keys import load_server
-from softfinger.daemon.wire.local_stop import IN_USE, free_socket_path
 from softfinger.daemon.wire.loop_link import repeated
 
 NO_WAIT = int(zmq.NOBLOCK)
@@ -34,8 +34,7 @@ class ClientSockets:
     def __init__(self, config: bounds.Config) -> None:
         """Load the keys; if there is no key folder, accept all clients. Raises KeyFileError."""
         self._config = config
-        self._folder = Path(config.keys)
-        self._keys = load_server(self._folder) if config.keys else None
+        self._keys = load_server(Path(config.keys)) if config.keys else None
         self._check_at = 0.0  # time of the next check of the key folder
         self._paths: list[str] = []  # files of ipc sockets
         self._context: zmq.Context[Any] = zmq.Context()
@@ -71,7 +70,9 @@ class ClientSockets:
 
     def authenticate(self, now: float) -> None:
         """Accept or reject new clients. Raises KeyFileError if a key was removed or is unusable."""
-        self._update_keys(now)
+        if self._keys is not None and now >= self._check_at:
+            self._check_at = now + bounds.KEY_CHECK_INTERVAL
+            self._keys = self._keys.updated()
         with contextlib.suppress(zmq.Again):
             for _ in range(bounds.HANDSHAKES_PER_TURN):
                 version, number, _, _, _, _, *key = self.handshakes.recv_multipart(NO_WAIT)
@@ -83,20 +84,6 @@ class ClientSockets:
     def name(self, part: zmq.Frame) -> str:
         """Return the client name that belongs to the sender's key, or "" if no keys are used."""
         return "" if self._keys is None else str(part.get("User-Id"))
-
-    def _update_keys(self, now: float) -> None:
-        if self._keys is None or now < self._check_at:
-            return
-        self._check_at = now + bounds.KEY_CHECK_INTERVAL
-        found = self._keys.left(self._folder)
-        with contextlib.suppress(NoDescriptor):  # All file descriptors are in use.
-            found = load_server(self._folder)
-        gone = [name for key, name in self._keys.clients.items() if key not in found.clients]
-        if gone or found.secret != self._keys.secret:
-            raise KeyFileError(
-                f"access.keys: disconnected clients without a key file: {', '.join(gone) or 'all'}"
-            )
-        self._keys = found
 
     def close(self) -> None:
         """Send queued messages for up to `bounds.LINGER_TIME`, then disconnect all clients."""

@@ -18,6 +18,7 @@ are checked in the same way.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import re
@@ -32,7 +33,7 @@ import zmq
 import zmq.auth
 import zmq.utils.z85
 
-from softfinger.daemon.errors import KeyFileError, NoDescriptor
+from softfinger.daemon.errors import KeyFileError
 from softfinger.kinematics.compiled.own_folder import check_above, fault
 
 LOCAL = "local"  # name of the local client, which every key folder contains
@@ -41,27 +42,36 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _LENGTH = 32  # length of a key [bytes]
 
 
+class _NoDescriptor(KeyFileError):
+    """Failure to read keys because too many files are open. The keys themselves may be valid."""
+
+
 @dataclass(frozen=True, slots=True)
 class ServerKeys:
     """The daemon's key pair and the public keys of its clients, encoded in Z85."""
 
+    folder: Path
     public: bytes
     secret: bytes
     clients: dict[bytes, str]  # maps each public key to a client name
 
-    def left(self, folder: Path) -> ServerKeys:
-        """Return the keys, excluding clients whose key files have been removed.
+    def updated(self) -> ServerKeys:
+        """Read the keys again.
 
-        Raises KeyFileError.
-
-        ``left`` does not open files, so it works even if no file descriptor is free.
+        Raises KeyFileError if the keys can't be read, or if a key was removed whose clients must be
+        disconnected. Removed files are also detected if no file descriptor is free.
         """
-        clients = _place(folder) / "clients"
+        clients = self.folder / "clients"
         _check_above(clients / "any")
-        kept = {
-            key: name for key, name in self.clients.items() if (clients / f"{name}.key").exists()
-        }
-        return ServerKeys(self.public, self.secret, kept)
+        gone = {name for name in self.clients.values() if not (clients / f"{name}.key").exists()}
+        found = self
+        with contextlib.suppress(_NoDescriptor):
+            found = load_server(self.folder)
+        gone |= {name for key, name in self.clients.items() if key not in found.clients}
+        if gone or found.secret != self.secret:
+            names = ", ".join(sorted(gone)) or "all"
+            raise KeyFileError(f"access.keys: disconnected clients without a key file: {names}")
+        return found
 
     def guard(self, socket: zmq.Socket[Any]) -> None:
         """Make a socket accept only clients with known keys. Call this method before `bind`."""
@@ -165,7 +175,7 @@ def load_server(folder: Path) -> ServerKeys:
             f"{place / 'clients'}: the folder does not contain client keys; create keys with "
             "`softfinger keys`"
         )
-    return ServerKeys(public, secret, clients)
+    return ServerKeys(place, public, secret, clients)
 
 
 def load_client(folder: Path) -> ClientKeys:
@@ -185,7 +195,7 @@ def _place(folder: Path) -> Path:
 
 
 def _unreadable(path: Path, error: OSError) -> KeyFileError:
-    kind = NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
+    kind = _NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
     return kind(f"{path}: can't be read: {error.strerror}; create key files with `softfinger keys`")
 
 

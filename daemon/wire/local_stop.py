@@ -11,17 +11,14 @@ import hashlib
 import os
 import socket
 from collections import deque
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgpack
 
 from softfinger.daemon.errors import AddressError
-from softfinger.daemon.own_files import home_folder, shared_folder
+from softfinger.daemon.own_files import free_socket_path, socket_folders
 from softfinger.kinematics.compiled.own_folder import require_own
 
-IN_USE = "is in use; is another softfinger running?"
 _LOCAL_HOSTS = ("localhost", "*", "0.0.0.0", "[::]")  # hosts that include 127.0.0.1
 _DATAGRAM_SIZE_MAX = 4096  # bytes
 _SENDER_COUNT_MAX = 16  # maximum number of senders that await a reply
@@ -38,7 +35,7 @@ class LocalStop:
         """Bind the socket. Raises AddressError."""
         self.notice = trouble = ""
         self._senders: deque[Any] = deque(maxlen=_SENDER_COUNT_MAX)
-        for folder in _folders():
+        for folder in socket_folders():
             self._path = folder / _name(address)
             try:
                 folder.mkdir(mode=0o700, exist_ok=True)
@@ -85,7 +82,7 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
 
     Returns None if this user's daemon is not running on this machine or does not respond.
     """
-    for folder in _folders() if hasattr(socket, "AF_UNIX") else ():
+    for folder in socket_folders() if hasattr(socket, "AF_UNIX") else ():
         with (
             contextlib.suppress(OSError, ValueError, msgpack.UnpackException),
             socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking,
@@ -102,24 +99,6 @@ def stop_locally(address: str, seconds: float) -> dict[str, Any] | None:
     return None
 
 
-def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
-    """Remove a killed process's socket file; if ``path`` is still occupied, return the reason."""
-    if not path.exists():
-        return ""
-    if not path.is_socket():
-        return "exists but is not a socket"
-    with socket.socket(socket.AF_UNIX, kind) as trial:
-        trial.setblocking(False)
-        try:
-            trial.connect(str(path))
-        except (FileNotFoundError, ConnectionRefusedError):
-            path.unlink(missing_ok=True)
-            return ""
-        except OSError:  # The socket's queue is full, or this user lacks permission.
-            pass
-    return IN_USE
-
-
 def _name(address: str) -> str:
     """Return the file name of the socket that belongs to a command address."""
     kind, _, place = address.partition("://")
@@ -127,15 +106,3 @@ def _name(address: str) -> str:
         return f"stop-{hashlib.sha256(os.path.realpath(place).encode()).hexdigest()[:16]}"
     host, _, port = place.rpartition(":")
     return f"stop-{'127.0.0.1' if host in _LOCAL_HOSTS else host.strip('[]')}-{port}"
-
-
-def _folders() -> Iterator[Path]:
-    """Yield candidate folders; the folders of the login session and the service come first."""
-    session = f"/run/user/{os.geteuid()}"
-    for place in (os.environ.get("XDG_RUNTIME_DIR"), "/run/softfinger", session):
-        if place:
-            yield Path(place, "softfinger")
-    yield shared_folder()
-    with contextlib.suppress(RuntimeError, OSError):  # The user has no home folder.
-        home_folder().parent.mkdir(parents=True, exist_ok=True)
-        yield home_folder()

@@ -28,7 +28,7 @@ from softfinger.daemon.gateway.server import Server
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire import loop_link
+from softfinger.daemon.wire import local_stop, loop_link
 from softfinger.daemon.wire.local_stop import LocalStop, stop_locally
 from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, Publisher
 from tests.conftest import Addresses, until
@@ -245,7 +245,7 @@ def test_the_local_socket_is_private_to_the_user(own_folder, addresses):
 def test_a_folder_that_others_can_write_to_is_refused(own_folder, addresses, monkeypatch, tmp_path):
     own_folder.mkdir()
     own_folder.chmod(0o777)
-    monkeypatch.setattr("softfinger.daemon.wire.local_stop._folders", lambda: iter([own_folder]))
+    monkeypatch.setattr(local_stop, "socket_folders", lambda: iter([own_folder]))
     with pytest.raises(AddressError, match="other users can write to it"):
         LocalStop(addresses[1])
     own_folder.rmdir()

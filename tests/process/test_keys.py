@@ -14,7 +14,7 @@ import zmq.auth
 
 from softfinger import Hand, NoStream
 from softfinger.daemon.client.command_client import NoAnswer, send
-from softfinger.daemon.errors import KeyFileError, NoDescriptor
+from softfinger.daemon.errors import KeyFileError
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.endpoints import ClientSockets
 from softfinger.daemon.wire.keys import load_client, load_server, make_keys
@@ -121,7 +121,7 @@ def test_client_keys_are_still_revoked_without_free_file_descriptors(folder, mon
     clients = folder / "server" / "clients"
     try:
         monkeypatch.setattr(zmq.auth, "load_certificate", no_descriptor_left)
-        with pytest.raises(NoDescriptor):
+        with pytest.raises(KeyFileError, match=os.strerror(errno.EMFILE)):
             load_server(folder)
         keys.authenticate(1.0)
         (clients / "alice.key").unlink()

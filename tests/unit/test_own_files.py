@@ -159,8 +159,8 @@ def test_the_local_stop_falls_back_to_the_home_folder_and_reports_it(shared, mon
     theirs = shared / "theirs"
     theirs.mkdir()
     theirs.chmod(0o777)
-    found = [theirs, *list(local_stop._folders())[-1:]]
-    monkeypatch.setattr(local_stop, "_folders", lambda: iter(found))
+    found = [theirs, *list(own_files.socket_folders())[-1:]]
+    monkeypatch.setattr(local_stop, "socket_folders", lambda: iter(found))
     local = LocalStop("tcp://127.0.0.1:9873")
     try:
         cure = f"chmod go-w {theirs}"
