@@ -9,110 +9,57 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from softfinger.daemon.client.asynchronous import AsyncHand, AsyncSubscription
-    from softfinger.daemon.client.command_client import NoAnswer
-    from softfinger.daemon.client.hand import Hand, Subscription
-    from softfinger.daemon.client.stream import to_columns
-    from softfinger.daemon.errors import (
-        HandClosed,
-        HandFault,
-        KeyFileError,
-        NoStream,
-        NotInTime,
-        Reason,
-        RecordingError,
-        Refused,
-        SettingsError,
-        WrongThread,
-    )
-    from softfinger.daemon.wire.schema import (
-        AnsweredCommand,
-        Event,
-        FingerState,
-        HandSettings,
-        HandState,
-        InputFinger,
-        InputReading,
-        LoopStatistics,
-        ObjectState,
-        Rates,
-        Spread,
-        TactileFrame,
-        TickInput,
-        TrueFinger,
-        TrueObject,
-        TrueState,
-    )
-    from softfinger.kinematics.contact.closed_form import Fingertip
-    from softfinger.kinematics.contact.material import Material
-    from softfinger.kinematics.contact.material_fit import MaterialError
-    from softfinger.kinematics.contact.table import Certificate, ContactForces, ContactTable
-    from softfinger.kinematics.contact.table_record import TableError
-    from softfinger.kinematics.estimation.error_budget import Uncertainty
-    from softfinger.kinematics.estimation.estimator import (
-        ContactEstimate,
-        ContactEstimator,
-        Readings,
-    )
-    from softfinger.kinematics.estimation.invalid import Invalid
-    from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-    from softfinger.tools.recordings.reader import read_recording
+if TYPE_CHECKING:  # the same names as in `_PUBLIC`, for type checkers
+    from softfinger.daemon.client.asynchronous import AsyncHand as AsyncHand
+    from softfinger.daemon.client.asynchronous import AsyncSubscription as AsyncSubscription
+    from softfinger.daemon.client.command_client import NoAnswer as NoAnswer
+    from softfinger.daemon.client.hand import Hand as Hand
+    from softfinger.daemon.client.hand import Subscription as Subscription
+    from softfinger.daemon.client.stream import to_columns as to_columns
+    from softfinger.daemon.errors import HandClosed as HandClosed
+    from softfinger.daemon.errors import HandFault as HandFault
+    from softfinger.daemon.errors import KeyFileError as KeyFileError
+    from softfinger.daemon.errors import NoStream as NoStream
+    from softfinger.daemon.errors import NotInTime as NotInTime
+    from softfinger.daemon.errors import Reason as Reason
+    from softfinger.daemon.errors import RecordingError as RecordingError
+    from softfinger.daemon.errors import Refused as Refused
+    from softfinger.daemon.errors import SettingsError as SettingsError
+    from softfinger.daemon.errors import WrongThread as WrongThread
+    from softfinger.daemon.wire.schema import AnsweredCommand as AnsweredCommand
+    from softfinger.daemon.wire.schema import Event as Event
+    from softfinger.daemon.wire.schema import FingerState as FingerState
+    from softfinger.daemon.wire.schema import HandSettings as HandSettings
+    from softfinger.daemon.wire.schema import HandState as HandState
+    from softfinger.daemon.wire.schema import InputFinger as InputFinger
+    from softfinger.daemon.wire.schema import InputReading as InputReading
+    from softfinger.daemon.wire.schema import LoopStatistics as LoopStatistics
+    from softfinger.daemon.wire.schema import ObjectState as ObjectState
+    from softfinger.daemon.wire.schema import Rates as Rates
+    from softfinger.daemon.wire.schema import Spread as Spread
+    from softfinger.daemon.wire.schema import TactileFrame as TactileFrame
+    from softfinger.daemon.wire.schema import TickInput as TickInput
+    from softfinger.daemon.wire.schema import TrueFinger as TrueFinger
+    from softfinger.daemon.wire.schema import TrueObject as TrueObject
+    from softfinger.daemon.wire.schema import TrueState as TrueState
+    from softfinger.kinematics.contact.closed_form import Fingertip as Fingertip
+    from softfinger.kinematics.contact.material import Material as Material
+    from softfinger.kinematics.contact.material_fit import MaterialError as MaterialError
+    from softfinger.kinematics.contact.table import Certificate as Certificate
+    from softfinger.kinematics.contact.table import ContactForces as ContactForces
+    from softfinger.kinematics.contact.table import ContactTable as ContactTable
+    from softfinger.kinematics.contact.table_record import TableError as TableError
+    from softfinger.kinematics.estimation.error_budget import Uncertainty as Uncertainty
+    from softfinger.kinematics.estimation.estimator import ContactEstimate as ContactEstimate
+    from softfinger.kinematics.estimation.estimator import ContactEstimator as ContactEstimator
+    from softfinger.kinematics.estimation.estimator import Readings as Readings
+    from softfinger.kinematics.estimation.invalid import Invalid as Invalid
+    from softfinger.kinematics.sensing.pressure_grid import SensorGrid as SensorGrid
+    from softfinger.tools.recordings.reader import read_recording as read_recording
 
 __version__ = "0.2.0"
 
-__all__ = [
-    "AnsweredCommand",
-    "AsyncHand",
-    "AsyncSubscription",
-    "Certificate",
-    "ContactEstimate",
-    "ContactEstimator",
-    "ContactForces",
-    "ContactTable",
-    "Event",
-    "FingerState",
-    "Fingertip",
-    "Hand",
-    "HandClosed",
-    "HandFault",
-    "HandSettings",
-    "HandState",
-    "InputFinger",
-    "InputReading",
-    "Invalid",
-    "KeyFileError",
-    "LoopStatistics",
-    "Material",
-    "MaterialError",
-    "NoAnswer",
-    "NoStream",
-    "NotInTime",
-    "ObjectState",
-    "Rates",
-    "Readings",
-    "Reason",
-    "RecordingError",
-    "Refused",
-    "SensorGrid",
-    "SettingsError",
-    "SoftfingerError",
-    "Spread",
-    "Subscription",
-    "TableError",
-    "TactileFrame",
-    "TickInput",
-    "TrueFinger",
-    "TrueObject",
-    "TrueState",
-    "Uncertainty",
-    "WrongThread",
-    "__version__",
-    "read_recording",
-    "to_columns",
-]
-
-# Public names of each module. The imports above declare the same names for type checkers.
+# Public names of each module
 _PUBLIC = {
     "daemon.client.asynchronous": "AsyncHand AsyncSubscription",
     "daemon.client.command_client": "NoAnswer",
@@ -135,6 +82,8 @@ _PUBLIC = {
     "tools.recordings.reader": "read_recording",
 }
 _MODULES = {name: module for module, names in _PUBLIC.items() for name in names.split()}
+
+__all__ = sorted([*_MODULES, "SoftfingerError", "__version__"])
 
 
 class SoftfingerError(Exception):
