@@ -125,19 +125,11 @@ def addresses(text: str) -> tuple[str, str]:
     ArgumentTypeError
         If an address is malformed, or its host is unknown.
     """
-    from softfinger.daemon.client.connection import (
-        both_addresses,
-        default_addresses,
-        is_host,
-        require_address,
-    )
+    from softfinger.daemon.client.connection import both_addresses, is_host, require_address
 
     try:
-        found = text, text
-        if not text:
-            found = default_addresses()
-        elif "," in text or is_host(text):
-            found = both_addresses(text, "address")
+        is_one = text and "," not in text and not is_host(text)
+        found = (text, text) if is_one else both_addresses(text)
         for address in found:
             require_address(address)
         return found

@@ -21,7 +21,6 @@ from softfinger.daemon.client.connection import (
     SILENCE_TIME,
     OneThread,
     both_addresses,
-    default_addresses,
     is_host,
     require_address,
     still_waiting,
@@ -197,9 +196,9 @@ class HandClient(Generic[_Done]):
         keys: Path | None = None,
     ) -> None:
         if stream and not commands and ("," in stream or is_host(stream)):
-            stream, commands = both_addresses(stream, "address")
+            stream, commands = both_addresses(stream)
         elif not (stream and commands):
-            usual = default_addresses()
+            usual = both_addresses()
             stream, commands = stream or usual[0], commands or usual[1]
         self.stream_address, self.command_address = stream, commands
         for address in (self.stream_address, self.command_address):

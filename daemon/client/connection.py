@@ -27,24 +27,17 @@ _TCP = re.compile(r"tcp://(?:.*;)?(.*):([0-9]{1,5})")
 _IPC = re.compile(r"ipc://.{1,107}")  # The operating system limits the length of a socket's path.
 
 
-def default_addresses() -> tuple[str, str]:
-    """Return the addresses from SOFTFINGER_ADDRESS if the variable is set, otherwise the defaults.
-
-    Raises SettingsError if the variable is malformed.
-    """
-    named = os.environ.get("SOFTFINGER_ADDRESS", "").strip()
-    if not named:
-        return STREAM_ADDRESS, COMMAND_ADDRESS
-    return both_addresses(named, "SOFTFINGER_ADDRESS")
-
-
-def both_addresses(named: str, where: str) -> tuple[str, str]:
+def both_addresses(named: str = "") -> tuple[str, str]:
     """Parse the stream address and the command address from ``named``.
 
     The string ``tcp://HOST`` selects the default ports. Otherwise, ``named`` contains both
-    addresses, separated by a comma. Raises SettingsError if the string has any other form. The
-    error message begins with ``where``.
+    addresses, separated by a comma. An empty string selects SOFTFINGER_ADDRESS or, if the variable
+    is not set, the default addresses. Raises SettingsError if the string has any other form.
     """
+    where = "address"
+    if not named:
+        where = "SOFTFINGER_ADDRESS"
+        named = os.environ.get(where, "").strip() or f"{STREAM_ADDRESS},{COMMAND_ADDRESS}"
     addresses = [part.strip() for part in named.split(",")]
     if is_host(named):
         stream, commands = (
