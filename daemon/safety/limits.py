@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -192,7 +193,7 @@ def _touches(contact: Contact) -> bool:
 # check returns a description of the violation, or "" if the state is within the bound. Checks do
 # not modify the state. NaN violates every bound.
 Check = Callable[[View, State, float], str]
-FingerCheck = Callable[[View, State, float, int], str]
+FingerCheck = Callable[..., str]  # the arguments of a check and the index of a finger
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +233,12 @@ class Limit:
             return ""
 
         self(judge)
+        return check
+
+    def sides(self, check: FingerCheck) -> FingerCheck:
+        """Add one row for each finger, whose name replaces ``{side}`` in the name of the row."""
+        for i, side in enumerate(FINGERS):
+            replace(self, name=self.name.format(side=side))(partial(check, i=i))
         return check
 
 
@@ -665,33 +672,27 @@ def _gain_fault(view: View, finger: int) -> str:
     )
 
 
-def _add_consistency_checks(finger: int, side: str) -> None:
-    @Limit(f"consistency.{side}_sensor",
-        "difference between a tip's frames and the values expected from the joints and the "
-        "other tip", "warn", ("tactile.gain_error",), "sensors", in_turn=True)  # fmt: skip
-    def _sensor(view: View, state: State, _: float) -> str:
-        if finger not in view.fingers:
-            return ""
-        # Check the gain only during a grip. After a release, the sensor cells may relax more slowly
-        # than the tip.
-        return _sensor_fault(view, state, finger) or (
-            _gain_fault(view, finger) if view.holds(state) else ""
-        )
-
-    @Limit(f"consistency.{side}_current", "difference between the measured current and the "
-        "goal current of a joint in a grip", "warn", (), "servos", in_turn=True)  # fmt: skip
-    def _current(view: View, state: State, _: float) -> str:
-        if not view.grasp.has_wrong_current[finger]:
-            return ""
-        return (
-            f"the {side} joint's measured current is {state.reading.current[finger]:.2f} A, but "
-            f"its goal current is {state.goal.current[finger]:.2f} A, so the measured current is "
-            "ignored"
-        )
+@Limit("consistency.{side}_sensor",
+    "difference between a tip's frames and the values expected from the joints and the other tip",
+    "warn", ("tactile.gain_error",), "sensors", in_turn=True).sides  # fmt: skip
+def _sensor(view: View, state: State, _: float, i: int) -> str:
+    if i not in view.fingers:
+        return ""
+    # Check the gain only during a grip. After a release, the sensor cells may relax more slowly
+    # than the tip.
+    return _sensor_fault(view, state, i) or (_gain_fault(view, i) if view.holds(state) else "")
 
 
-for _finger, _side in enumerate(FINGERS):
-    _add_consistency_checks(_finger, _side)
+@Limit("consistency.{side}_current",
+    "difference between the measured current and the goal current of a joint in a grip", "warn",
+    (), "servos", in_turn=True).sides  # fmt: skip
+def _current(view: View, state: State, _: float, i: int) -> str:
+    if not view.grasp.has_wrong_current[i]:
+        return ""
+    return (
+        f"the {FINGERS[i]} joint's measured current is {state.reading.current[i]:.2f} A, but its "
+        f"goal current is {state.goal.current[i]:.2f} A, so the measured current is ignored"
+    )
 
 
 @Limit("consistency.force", "measured force that has not followed the commanded force for 0.3 s, "

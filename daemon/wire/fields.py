@@ -101,14 +101,16 @@ def record(cls: type[_Record]) -> type[_Record]:
     return made
 
 
+@dataclass_transform(frozen_default=True)
 def topic(
     name: bytes, summary: str, source: Callable[..., Any]
 ) -> Callable[[type[_Record]], type[_Record]]:
-    """Declare a topic's record; each message is built from an instance of ``source``."""
+    """Turn a class into a topic's record; each message is built from an instance of ``source``."""
 
     def declare(cls: type[_Record]) -> type[_Record]:
-        TOPICS[name] = Topic(cls, summary, source, tuple(fields_of(cls)))
-        return cls
+        made = record(cls)
+        TOPICS[name] = Topic(made, summary, source, tuple(fields_of(made)))
+        return made
 
     return declare
 

@@ -276,7 +276,6 @@ class ObjectState:
     "The state of the hand, every n-th tick (`stream.state_rate`).",
     StateSource,
 )
-@record
 class HandState(_TickMessage):
     """One ``hand/state`` message."""
 
@@ -343,7 +342,6 @@ _info = _tactile.of(lambda m: m.info)
     "Tactile frames (`stream.tactile_rate`), one message per finger.",
     TactileSource,
 )
-@record
 class TactileFrame:
     """One ``hand/tactile`` message. Raises ValueError if the data is not a rows × cols grid."""
 
@@ -422,7 +420,6 @@ _event = FieldSource[EventSource]()
     "Events: mode changes, faults and warnings. New subscribers first receive the last 50 events.",
     EventSource,
 )
-@record
 class Event(_Announcement):
     """One ``hand/event`` message."""
 
@@ -474,7 +471,6 @@ _stats = FieldSource[StatsSource]()
 
 
 @topic(STATS, "Timing of the loop, once a second.", StatsSource)
-@record
 class LoopStatistics(_TickMessage):
     """One ``hand/stats`` message."""
 
@@ -507,7 +503,6 @@ _hand_info = FieldSource[SettingsSource]().of(lambda m: m.info)
     "Description of this hand, sent at startup and to each new subscriber.",
     SettingsSource,
 )
-@record
 class HandSettings(_Announcement):
     """One ``hand/settings`` message."""
 
@@ -538,7 +533,6 @@ _command = FieldSource[CommandSource]()
 @topic(
     COMMAND, "Every command that received a reply, from any client, except `status`.", CommandSource
 )
-@record
 class AnsweredCommand(_Announcement):
     """One ``hand/command`` message."""
 
@@ -622,7 +616,6 @@ class InputFinger:
     "All inputs of each tick, from which `replay --recompute` recomputes the tick.",
     InputSource,
 )
-@record
 class TickInput:
     """One ``hand/input`` message."""
 
@@ -681,7 +674,6 @@ class TrueObject:
 
 
 @topic(TRUTH, "True state of a simulated hand, sent with each `hand/state`.", TruthSource)
-@record
 class TrueState(_TickMessage):
     """One ``hand/truth`` message.
 
