@@ -25,6 +25,7 @@ import re
 import shutil
 import stat
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,8 @@ class ServerKeys:
         disconnected. Removed files are also detected if no file descriptor is free.
         """
         clients = self.folder / "clients"
-        _check_above(clients / "any")
+        with _reported(clients):
+            check_above(clients / "any")
         gone = {name for name in self.clients.values() if not (clients / f"{name}.key").exists()}
         found = self
         with contextlib.suppress(_NoDescriptor):
@@ -138,7 +140,7 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     before = os.umask(0o077)
     try:
         (server / "clients").mkdir(parents=True, exist_ok=True)
-        _check_above(server / "clients" / "any")
+        check_above(server / "clients" / "any")
         if new:
             zmq.auth.create_certificates(server, "server")
         for name in wanted:
@@ -150,7 +152,8 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
             # keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     except OSError as error:
-        raise KeyFileError(f"{error.filename or folder}: {error.strerror}") from None
+        text = f"{error.filename or folder}: {error.strerror}" if error.errno else str(error)
+        raise KeyFileError(text) from None
     finally:
         os.umask(before)
     return [folder / name for name in (["server", *wanted] if new else wanted)]
@@ -162,20 +165,18 @@ def load_server(folder: Path) -> ServerKeys:
     Raises KeyFileError.
     """
     check_curve()
-    place = _place(folder)
+    place = folder if (folder / "server.key_secret").exists() else folder / "server"
     public, secret = _pair(place / "server.key_secret")
-    _check_above(place / "clients" / "any")
-    try:
-        files = sorted((place / "clients").glob("*.key"))
-    except OSError as error:
-        raise _unreadable(place / "clients", error) from None
-    clients = {_keys(path)[0]: path.stem for path in files}
-    if not clients:
+    clients = place / "clients"
+    with _reported(clients):
+        check_above(clients / "any")
+        names = {_keys(path)[0]: path.stem for path in sorted(clients.glob("*.key"))}
+    if not names:
         raise KeyFileError(
-            f"{place / 'clients'}: the folder does not contain client keys; create keys with "
+            f"{clients}: the folder does not contain client keys; create keys with "
             "`softfinger keys`"
         )
-    return ServerKeys(place, public, secret, clients)
+    return ServerKeys(place, public, secret, names)
 
 
 def load_client(folder: Path) -> ClientKeys:
@@ -189,18 +190,22 @@ def load_client(folder: Path) -> ClientKeys:
     return ClientKeys(_keys(place / "server.key")[0], public, secret)
 
 
-def _place(folder: Path) -> Path:
-    """Return the server's folder: ``folder`` itself or its ``server`` subfolder."""
-    return folder if (folder / "server.key_secret").exists() else folder / "server"
-
-
-def _unreadable(path: Path, error: OSError) -> KeyFileError:
-    kind = _NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
-    return kind(f"{path}: can't be read: {error.strerror}; create key files with `softfinger keys`")
+@contextlib.contextmanager
+def _reported(path: Path) -> Iterator[None]:
+    """Convert system errors and failed checks of the folders to KeyFileError."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:  # raised by `check_above`
+            raise KeyFileError(str(error)) from None
+        kind = _NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
+        text = f"{path}: can't be read: {error.strerror}; create key files with `softfinger keys`"
+        raise kind(text) from None
 
 
 def _pair(path: Path) -> tuple[bytes, bytes]:
-    _check_above(path)
+    with _reported(path):
+        check_above(path)
     public, secret = _keys(path, secret=True)
     if secret is None:
         raise KeyFileError(f"{path}: the file does not contain a secret key")
@@ -212,7 +217,7 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
 
     Raises KeyFileError if another user owns the file, may write to it, or may read a secret key.
     """
-    try:
+    with _reported(path):
         status = path.stat()
         mode = stat.S_IMODE(status.st_mode)
         if secret and mode & 0o077:
@@ -221,22 +226,11 @@ def _keys(path: Path, secret: bool = False) -> tuple[bytes, bytes | None]:
             )
         if wrong := fault(path, status):
             raise KeyFileError(wrong)
-        keys = zmq.auth.load_certificate(path)
-        for key in filter(None, keys):
-            if len(zmq.utils.z85.decode(key)) != _LENGTH:
-                raise ValueError("a key has the wrong length")
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    except (ValueError, LookupError, struct.error):  # struct.error: a value exceeds the Z85 range
-        raise KeyFileError(f"{path}: not a key file") from None
+        try:
+            keys = zmq.auth.load_certificate(path)
+            lengths = {len(zmq.utils.z85.decode(key)) for key in filter(None, keys)}
+        except (ValueError, LookupError, struct.error):  # struct.error: outside the Z85 range
+            lengths = set()
+        if lengths != {_LENGTH}:
+            raise KeyFileError(f"{path}: not a key file")
     return keys
-
-
-def _check_above(path: Path) -> None:
-    """Check all folders above a file. Raises KeyFileError."""
-    try:
-        check_above(path)
-    except PermissionError as error:
-        raise KeyFileError(str(error)) from None
-    except OSError as error:
-        raise _unreadable(path, error) from None
