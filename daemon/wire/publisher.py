@@ -78,12 +78,17 @@ def _packer(record: type[Any]) -> Pack:
 
 _INDEX = {topic: index for index, topic in enumerate(TOPICS)}
 GATEWAY_TOPICS = [topic.decode() for topic in TOPICS]
-REPEATED_COUNTS = {SETTINGS: 1, EVENT: 50}  # number of messages repeated to late subscribers
+_REPEATED_COUNTS = {SETTINGS: 1, EVENT: 50}  # number of messages repeated to late subscribers
 
 
 def bit(topic: bytes) -> int:
     """Return a topic's bit in `Publisher.wanted`."""
     return 1 << _INDEX[topic]
+
+
+def publish(link: Link, topic: bytes, packed: bytes) -> None:
+    """Publish a packed message."""
+    link.publish(_INDEX[topic], packed, _REPEATED_COUNTS.get(topic, 0))
 
 
 _COMMANDS = bit(COMMAND)
@@ -104,8 +109,7 @@ class Publisher:
 
     def send(self, topic: bytes, *arguments: object) -> None:
         """Publish a message; ``arguments`` are passed to the topic's source in `wire.schema`."""
-        packed = self._pack[topic](*arguments)
-        self._link.publish(_INDEX[topic], packed, REPEATED_COUNTS.get(topic, 0))
+        publish(self._link, topic, self._pack[topic](*arguments))
 
     def event(self, wall: float, t: float, level: str, kind: str, text: str) -> None:
         """Publish ``hand/event``."""

@@ -35,7 +35,7 @@ from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.command_server import CommandServer
 from softfinger.daemon.wire.loop_link import Ask, Link
-from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, REPEATED_COUNTS, bit, pack
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, bit, pack, publish
 from softfinger.daemon.wire.schema import HandState
 from softfinger.tools.processes.compile import build_kernels, print_event
 from softfinger.tools.recordings.reader import Recording
@@ -447,9 +447,7 @@ class RecordedHand(VirtualTimeHand):
             self._t = max(self._t, stamp - self._recording.start)
         if topic == schema.STATE:
             self._mode = {name: message.get(name) for name in ("mode", "fault", "torque")}
-        self._link.publish(
-            GATEWAY_TOPICS.index(topic.decode()), pack(message), REPEATED_COUNTS.get(topic, 0)
-        )
+        publish(self._link, topic, pack(message))
         self._commands.serve(self._note)
 
     def _send(self, request: dict[str, Any]) -> dict[str, Any]:

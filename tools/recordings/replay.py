@@ -14,7 +14,7 @@ from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.profile.settings import StreamSettings
 from softfinger.daemon.profile.validation import address_problem
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, REPEATED_COUNTS, pack
+from softfinger.daemon.wire.publisher import GATEWAY_TOPICS, pack, publish
 from softfinger.tools.arguments import add_range, number, range_text, to_stderr
 from softfinger.tools.stop_condition import StopCondition
 
@@ -213,8 +213,7 @@ class Wire:
         give_up = time.monotonic() + _SEND_TIMEOUT
         while not self._link.look() and time.monotonic() < give_up:
             time.sleep(_POLL_INTERVAL)
-        index = GATEWAY_TOPICS.index(topic.decode())
-        self._link.publish(index, pack(message), REPEATED_COUNTS.get(topic, 0))
+        publish(self._link, topic, pack(message))
 
     def __enter__(self) -> Wire:
         return self
