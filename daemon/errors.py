@@ -12,25 +12,6 @@ from enum import StrEnum
 
 from softfinger import SoftfingerError as SoftfingerError
 
-__all__ = [
-    "AddressError",
-    "HandClosed",
-    "HandFault",
-    "KeyFileError",
-    "NoStream",
-    "NotInTime",
-    "PluginError",
-    "Reason",
-    "RecordingError",
-    "Refused",
-    "ServoError",
-    "ServosSilent",
-    "SettingsError",
-    "TactileError",
-    "WrongThread",
-]
-
-
 _SIMILAR = 0.75  # minimum similarity of a suggested word; allows about one wrong letter in four
 
 

@@ -24,8 +24,6 @@ from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
 
-__all__ = ["AsyncHand", "AsyncSubscription"]
-
 _Record = TypeVar("_Record")
 
 
@@ -137,15 +135,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
                     return state
 
     async def command(self, name: str, **numbers: float | None) -> dict[str, Any]:
-        """Send one command and return the reply. Arguments with the value None are not sent.
-
-        Raises
-        ------
-        Refused
-            If the daemon refuses the command. The message gives the reason.
-        NoAnswer
-            If the reply does not arrive in time.
-        """
+        """Send one command and return the reply; see `Hand.command`."""
         attempts = Attempts(self._request(name, numbers), self.timeout)
         where, keys = self.command_address, self._keys
         reply = await _in_own_thread(send_once, where, attempts, keys)

@@ -31,8 +31,6 @@ from softfinger.daemon.wire.keys import ClientKeys, load_client
 from softfinger.daemon.wire.local_stop import stop_locally
 from softfinger.daemon.wire.loop_link import machine_time
 
-__all__ = ["HandClient", "NoAnswer", "send"]
-
 _Done = TypeVar("_Done")
 
 _log = logging.getLogger(__name__)

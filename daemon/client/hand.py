@@ -12,8 +12,6 @@ from softfinger.daemon.client.stream import Subscriber, Wait, no_stream
 from softfinger.daemon.errors import NoStream, Refused
 from softfinger.daemon.wire.schema import EVENT, STATE, TACTILE, Event, HandState, TactileFrame
 
-__all__ = ["Hand", "Subscription"]
-
 _Record = TypeVar("_Record")
 
 

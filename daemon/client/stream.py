@@ -32,8 +32,6 @@ from softfinger.daemon.client.connection import (
 from softfinger.daemon.errors import HandClosed, HandFault, NoStream, NotInTime
 from softfinger.daemon.wire.schema import SCHEMA, STATE, TOPICS, HandState, fields_of
 
-__all__ = ["read", "to_columns"]
-
 _Record = TypeVar("_Record")
 
 _STORED_MESSAGE_COUNT = 1000  # number of message numbers stored to detect repetitions

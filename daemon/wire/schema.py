@@ -35,35 +35,6 @@ from softfinger.daemon.wire.fields import FieldSource, record, topic
 from softfinger.daemon.wire.fields import fields_of as fields_of
 from softfinger.kinematics.estimation.invalid import Invalid
 
-__all__ = [
-    "COMMAND",
-    "EVENT",
-    "INPUT",
-    "SCHEMA",
-    "SETTINGS",
-    "STATE",
-    "STATS",
-    "TACTILE",
-    "TOPICS",
-    "TRUTH",
-    "AnsweredCommand",
-    "Event",
-    "FingerState",
-    "HandSettings",
-    "HandState",
-    "InputFinger",
-    "InputReading",
-    "LoopStatistics",
-    "ObjectState",
-    "Rates",
-    "Spread",
-    "TactileFrame",
-    "TickInput",
-    "TrueFinger",
-    "TrueObject",
-    "TrueState",
-]
-
 SCHEMA = 1
 STATE = b"hand/state"
 TACTILE = b"hand/tactile"
