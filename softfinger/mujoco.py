@@ -33,8 +33,8 @@ from softfinger.daemon.profile.factory import make_grid, make_material, make_tab
 from softfinger.daemon.profile.fields import Section
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
+from softfinger.daemon.simulation.physics.contacts import rim_on_plane
 from softfinger.daemon.simulation.physics.forces import ELECTRIC_TIME, current_reference
-from softfinger.daemon.simulation.physics.outline import rim_on_plane
 from softfinger.daemon.simulation.physics.plant import settle
 from softfinger.daemon.simulation.physics.plant_state import (
     FloatArray,
@@ -109,7 +109,7 @@ def _set_forces(p: Parameters, table: Table, touch: Touch, rate_across: float) -
         tip.shear_variance = touch.shear_across**2
         contact_forces(p, table, tip, 1.0)
         stiffness = tip.stiffness[_SHEAR]
-        limit = p.friction * max(tip.normal, 0.0)
+        limit = p.tip_friction * max(tip.normal, 0.0)
         total = math.hypot(tip.tangential, stiffness * touch.shear_across)
         if total <= limit * (1.0 + 1e-9):
             break
@@ -204,7 +204,7 @@ def solve(
     for k in range(len(touches)):
         f, tangent = force[_ROWS * k : _ROWS * (k + 1)], touches[k].contact.tangent
         normal = max(f[0] - tangent * f[2], 0.0)
-        f[2:] *= min(p.friction * normal / max(math.hypot(f[2], f[3]), _VALUE_MIN), 1.0)
+        f[2:] *= min(p.tip_friction * normal / max(math.hypot(f[2], f[3]), _VALUE_MIN), 1.0)
         f[0] = normal + tangent * f[2]
     passive -= (force.reshape(n, 1) * rows).sum(axis=0)
     own[:] = -(force.reshape(n, 1) * inertial).sum(axis=0)
@@ -401,7 +401,10 @@ class Options(Section):
 
 
 class MujocoHand(SimulatedHand):
-    """Simulated hand with MuJoCo mechanics and the standard motor model; `energy` is always 0."""
+    """Simulated hand with MuJoCo mechanics and the standard motor model.
+
+    The energy of the plant is always 0.
+    """
 
     def __init__(
         self, settings: Settings, start: float = 0.0, table: ContactTable | None = None

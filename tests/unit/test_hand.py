@@ -130,11 +130,11 @@ def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
 def test_a_dropped_object_comes_to_rest_on_the_palm():
     for angle in (0.0, 0.4):
         hand = make(gravity=(0.0, -9.80665), object_angle=angle, palm=0.01)
-        energy = hand.energy()
+        energy = hand.plant.energy
         highest = 0.0
         for _ in range(2000):
             run(hand, 0.001)
-            later = hand.energy()
+            later = hand.plant.energy
             assert later <= energy + 1e-12
             energy = later
             if hand.t > 0.15:
@@ -151,7 +151,7 @@ def test_a_dropped_object_comes_to_rest_on_the_palm():
 def test_a_collision_conserves_momentum_and_energy():
     hand = make(object_mass=0.05, **LOSSLESS)
     place(hand, (0.0, 0.0), (-0.005, 0.08, 0.0), velocity=(-0.5, 0.0, 0.0))
-    start = hand.energy()
+    start = hand.plant.energy
     assert start == pytest.approx(0.5 * 0.05 * 0.25)
     impulse = 0.0
     while hand.t < 0.05:
@@ -165,7 +165,7 @@ def test_a_collision_conserves_momentum_and_energy():
     assert hand.plant.parameters.joint_inertia * hand.dq[0] == pytest.approx(
         -0.080 * impulse, rel=3e-3
     )
-    assert hand.energy() == pytest.approx(start, rel=1e-3)
+    assert hand.plant.energy == pytest.approx(start, rel=1e-3)
 
 
 # Servos.
@@ -200,10 +200,6 @@ def test_modes_torque_and_current_dynamics():
     hand.drive(0, CURRENT, False, 0.0, 0.2)
     run(hand, 0.02)
     assert abs(hand.current[0]) < 1e-6
-    with pytest.raises(ValueError, match="mode 16"):
-        hand.drive(0, 16, True, 0.0, 0.1)
-    with pytest.raises(ValueError, match="finite"):
-        hand.drive(0, BOUNDED, True, math.nan, 0.1)
 
 
 def test_end_stops_and_no_load_speed_limit_the_joints():
@@ -291,10 +287,8 @@ def test_samples_are_interpolated_at_the_frame_times():
         # would have errors of the same size.
         np.testing.assert_allclose(sample.d, exact.d, atol=8e-7)
         np.testing.assert_allclose(sample.theta, exact.theta, atol=1e-5)
-    with pytest.raises(LookupError):
-        hand.sample(count)
-    with pytest.raises(LookupError):
-        hand.sample(0)
+    assert hand.sample(count) is None
+    assert hand.sample(0) is None
 
 
 def test_the_step_divides_a_millisecond_and_decreases_with_stiffness():

@@ -157,6 +157,7 @@ def _frames(
             continue
         last = contact.seq
         sample = hand.sample(contact.seq - 1)
+        assert sample is not None
         truth = float(sample.d[0]), float(sample.theta[0])
         yield truth, _estimates(contact)
 

@@ -92,10 +92,10 @@ def plant(d: float, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     tip = hand.plant.stages[0].on_object[0]
     rows = []
     for k in range(_ROLL_STEPS + 1):
-        before, row = hand.object_pose.copy(), tip.rows[ALONG_SHEAR, 1:].copy()
+        before, row = hand.object_pose.copy(), tip.rows[ALONG_SHEAR, 2:].copy()
         roll(hand, d, -ROLLED * k / _ROLL_STEPS, 1.0 - share)
         if k:
-            row = 0.5 * (row + tip.rows[ALONG_SHEAR, 1:])
+            row = 0.5 * (row + tip.rows[ALONG_SHEAR, 2:])
             hand.shear[0] += row @ (hand.object_pose - before)
             hand.refresh()
         theta = float(hand.theta[0])

@@ -52,10 +52,16 @@ def elastic_energy(plant: Plant) -> float:
         energy += 0.5 * STOP_STIFFNESS * beyond * beyond
         gears = plant.gears[finger]
         deflection = gears.limited_deflection
-        energy += 0.5 * gears.friction / p.presliding * deflection * deflection
+        energy += 0.5 * gears.friction / p.joint_presliding * deflection * deflection
         energy += stage.on_object[finger].energy
         energy += stage.on_tip[finger].energy
     return energy
+
+
+@inner_kernel
+def total_energy(plant: Plant) -> float:
+    """Return the kinetic, elastic and gravitational energy [J]."""
+    return kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
 
 
 @inner_kernel
@@ -71,7 +77,7 @@ def is_on_rim(plant: Plant) -> bool:
 @inner_kernel
 def open_guard(plant: Plant) -> None:
     """Accept the new energy if code outside the integrator has changed the state."""
-    energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
+    energy = total_energy(plant)
     if energy != plant.energy:
         plant.energy = energy
         plant.energy_limit = energy
@@ -114,7 +120,7 @@ def guard_step(plant: Plant, was_on_rim: bool) -> int:
     allowed = limit
     if was_on_rim or is_on_rim(plant):
         allowed = min(limit, plant.energy + work)
-    elif plant.parameters.loss == 0.0:
+    elif plant.parameters.tip_loss == 0.0:
         allowed += _LOSSLESS_TOLERANCE * max(limit - weight, 0.0)
     if energy <= allowed + _ROUNDING * (moving + abs(energy) + abs(weight)):
         plant.energy = energy
@@ -161,7 +167,7 @@ def is_within_limit(plant: Plant) -> bool:
 @inner_kernel
 def allow_changed_energy(plant: Plant) -> None:
     """Update the energy and its limit after :func:`guard_step` has changed the state."""
-    energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
+    energy = total_energy(plant)
     plant.energy = energy
     plant.energy_limit = min(energy, plant.energy_limit + work_done(plant))
 
@@ -169,6 +175,6 @@ def allow_changed_energy(plant: Plant) -> None:
 @inner_kernel
 def allow_relaxed_energy(plant: Plant) -> None:
     """Update the energy after tip relaxation, and change the energy limit by the same amount."""
-    energy = kinetic_energy(plant) + elastic_energy(plant) + weight_energy(plant)
+    energy = total_energy(plant)
     plant.energy_limit += energy - plant.energy
     plant.energy = energy

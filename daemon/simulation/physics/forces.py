@@ -1,6 +1,6 @@
 """Compute the forces due to motors, weight, loads, friction and end stops.
 
-The modules `tip` and `extra_contacts` compute the contact forces.
+The module `contacts` adds the contact forces.
 """
 
 from __future__ import annotations
@@ -8,19 +8,19 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.servos.control_table import CURRENT_BASED_POSITION_MODE, CURRENT_MODE
-from softfinger.daemon.simulation.physics.extra_contacts import (
-    clear_extra,
+from softfinger.daemon.simulation.physics.contacts import (
     touch_each_other,
+    touch_object,
     touch_palm,
 )
 from softfinger.daemon.simulation.physics.plant_state import (
+    EXTRA_ROWS,
     NO_OBJECT,
     STOP_STIFFNESS,
     Motion,
     Plant,
     Stage,
 )
-from softfinger.daemon.simulation.physics.tip import touch_object
 from softfinger.kinematics.compiled.kernel import inner_kernel
 from softfinger.kinematics.contact.table_record import Table
 
@@ -116,10 +116,10 @@ def friction_level(plant: Plant, finger: int, rate: float, current: float) -> fl
     servos (arXiv 2410.08650). The load term is proportional to the gear torque, |external − motor|.
     """
     p = plant.parameters
-    still = math.exp(-abs(rate) / p.stribeck_speed)
+    still = math.exp(-abs(rate) / p.joint_stribeck_speed)
     gears = abs(plant.external[finger] - p.torque_constant * current)
-    share = p.load_friction[0] + still * p.load_friction[1]
-    friction: float = p.joint_friction + still * p.stribeck + share * gears
+    share = p.joint_load_friction[0] + still * p.joint_load_friction[1]
+    friction: float = p.joint_friction + still * p.joint_stribeck + share * gears
     return friction
 
 
@@ -146,8 +146,8 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
     bent = now.bristles[finger]
     if friction > gears.level:
         bent -= (1.0 - gears.level / friction) * 0.5 * (gears.deflection + bent)
-    bent = min(max(bent, -p.presliding), p.presliding)
-    stiffness = friction / p.presliding
+    bent = min(max(bent, -p.joint_presliding), p.joint_presliding)
+    stiffness = friction / p.joint_presliding
     torque: float = stiffness * bent
     damping = math.sqrt(stiffness * p.joint_inertia)
     if rate != 0.0:
@@ -208,21 +208,17 @@ def evaluate_hand(plant: Plant, table: Table, now: Motion, stage: Stage, is_firs
     free_object(plant, now)
     if is_first and plant.has_extra_rows:
         plant.has_extra_rows = False
-        clear_extra(plant)
+        for number in range(EXTRA_ROWS):
+            plant.extra[number].stiffness = 0.0
+            plant.extra[number].damping = 0.0
     if with_object:
         touch_palm(plant, now, stage, nx, ny, is_first)
     for finger in range(2):
-        torque = 0.0
+        forces[finger] = 0.0
         if p.finger_present[finger] != 0:
             place_finger(plant, finger, now.position[finger])
             if with_object:
-                tip = stage.on_object[finger]
-                touch_object(plant, table, tip, finger, now, nx, ny)
-                torque = tip.forces[0]
-                forces[2] += tip.forces[1]
-                forces[3] += tip.forces[2]
-                forces[4] += tip.forces[3]
-        forces[finger] = torque
+                touch_object(plant, table, stage.on_object[finger], finger, now, nx, ny)
     if p.finger_present[0] != 0 and p.finger_present[1] != 0:
         touch_each_other(plant, table, now, stage, is_first)
     for finger in range(2):

@@ -38,23 +38,21 @@ from softfinger.daemon.simulation.physics.forces import (
     set_motor_slopes,
 )
 from softfinger.daemon.simulation.physics.plant_state import (
+    ALONG_D,
     ALONG_SHEAR,
+    ALONG_THETA,
     CORNERS,
+    EXTRA_ROWS,
     NO_OBJECT,
     SHEARS,
+    ExtraRow,
+    FloatArray,
     Motion,
     Plant,
     Sample,
+    Stage,
 )
-from softfinger.daemon.simulation.physics.solver import (
-    add_extra_shears,
-    along_row,
-    factorise,
-    solve,
-    take_extra_stiffness,
-    take_stiffness,
-)
-from softfinger.daemon.simulation.physics.tip import relax_shears, relax_tips
+from softfinger.daemon.simulation.physics.tip import along_row, relax_shears, relax_tips
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.table_record import Table
@@ -62,28 +60,145 @@ from softfinger.kinematics.contact.table_record import Table
 _GAMMA = 1.0 - math.sqrt(0.5)
 
 
-@inner_kernel
-def bounded(value: float, limit: float) -> float:
-    """Clip ``value`` to ± ``limit``."""
-    return min(max(value, -limit), limit)
+# --- linear equations of a step, with g = γh -----------------------------------------------------
 
 
 @inner_kernel
-def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
-    """Add the motor torques to the load and set the rates of the currents in ``k``.
+def factorise(plant: Plant, g: float) -> None:
+    """Factorise the first-stage matrix M + gD + g²K for the five coordinates as L D Lᵀ.
 
-    The rates are valid at zero acceleration. A current i lags behind its reference r according to
-    i' = (r(q, ω) − i)/τ. Per unit of acceleration, the rate of the current decreases by (r_q g +
-    r_ω) g/(τ + g). The step matrix contains this decrease.
+    The matrix always includes the contacts between the tips and the object. Palm contacts and
+    tip-to-tip contacts add extra rows.
     """
-    lag, constant = ELECTRIC_TIME, plant.parameters.torque_constant
+    p = plant.parameters
+    full = plant.factors
+    for i in range(5):
+        for j in range(5):
+            full[i, j] = 0.0
     for j in range(2):
+        motor = plant.motor_by_rate[j] + g * plant.motor_by_q[j]
+        full[j, j] = p.joint_inertia + g * (plant.drag[j] + g * (joint_stiffness(plant, j) + motor))
+    full[2, 2] = p.mass + g * plant.drag[2]
+    full[3, 3] = p.mass + g * plant.drag[3]
+    full[4, 4] = p.inertia + g * plant.drag[4]
+    for finger in range(2):
+        tip = plant.stages[0].on_object[finger]
+        for r in range(3):
+            weight = g * (tip.damping[r] + g * tip.stiffness[r])
+            if weight == 0.0:
+                continue
+            for i in range(5):
+                by = weight * tip.rows[r, i]
+                for j in range(5):
+                    full[i, j] += by * tip.rows[r, j]
+    for number in range(EXTRA_ROWS if plant.has_extra_rows else 0):
+        extra = plant.extra[number]
+        weight = g * (extra.damping + g * extra.stiffness)
+        if weight == 0.0:
+            continue
+        for i in range(5):
+            by = weight * extra.row[i]
+            for j in range(5):
+                full[i, j] += by * extra.row[j]
+    for k in range(5):
+        if p.joints_held if k < 2 else p.object_held:
+            for j in range(5):
+                full[k, j] = 0.0
+                full[j, k] = 0.0
+            continue
+        pivot = full[k, k]
+        for i in range(k + 1, 5):
+            ratio = full[i, k] / pivot
+            for j in range(k + 1, 5):
+                full[i, j] -= ratio * full[k, j]
+            full[i, k] = ratio
+        full[k, k] = 1.0 / pivot
+
+
+@inner_kernel
+def solve(plant: Plant, k: Motion) -> None:
+    """Solve the step equations for the velocities in ``k``, which are 0 for fixed bodies."""
+    full, out = plant.factors, k.velocity
+    for i in range(5):
+        value = plant.load[i]
+        for j in range(i):
+            value -= full[i, j] * out[j]
+        out[i] = value
+    for i in range(5):
+        out[i] *= full[i, i]
+    for i in range(4, -1, -1):
+        for j in range(i + 1, 5):
+            out[i] -= full[j, i] * out[j]
+
+
+@inner_kernel
+def take_stiffness(plant: Plant, k: Motion, g: float) -> None:
+    """Subtract g K r from the load. K is the first-stage stiffness; r are the rates in ``k``."""
+    for finger in range(2):
+        tip = plant.stages[0].on_object[finger]
+        rows, stiffness = tip.rows, tip.stiffness
+        by_d = g * stiffness[ALONG_D] * along_row(tip, ALONG_D, k.position)
+        by_r = g * stiffness[ALONG_THETA] * along_row(tip, ALONG_THETA, k.position)
+        by_t = g * stiffness[ALONG_SHEAR] * k.shear[finger]
+        for j in range(5):
+            plant.load[j] -= (
+                rows[ALONG_D, j] * by_d + rows[ALONG_THETA, j] * by_r + rows[ALONG_SHEAR, j] * by_t
+            )
+
+
+@inner_kernel
+def along_extra(extra: ExtraRow, rates: FloatArray) -> float:
+    """Return the scalar product of an extra row and the ``rates`` of the coordinates."""
+    rate: float = 0.0
+    for j in range(5):
+        rate += extra.row[j] * rates[j]
+    return rate
+
+
+@inner_kernel
+def take_extra_stiffness(plant: Plant, k: Motion, g: float) -> None:
+    """Subtract the extra rows' g K r from the load; r are the rates in ``k``."""
+    for number in range(EXTRA_ROWS if plant.has_extra_rows else 0):
+        extra = plant.extra[number]
+        if extra.stiffness == 0.0:
+            continue
+        shear = extra.shear
+        rate = k.extra_shear[shear - 1] if shear > 0 else along_extra(extra, k.position)
+        by = g * extra.stiffness * rate
+        for j in range(5):
+            plant.load[j] -= by * extra.row[j]
+
+
+# --- stages of a step ----------------------------------------------------------------------------
+
+
+@inner_kernel
+def begin_stage(
+    plant: Plant, now: Motion, stage: Stage, earlier: Motion, k: Motion, g: float
+) -> None:
+    """Set the load and the rates in ``k`` at zero acceleration.
+
+    ``now`` and ``stage`` contain the state and the contacts. ``earlier`` contains k1 in the second
+    stage, and zeros in the first stage. A current i lags behind its reference r according to i' =
+    (r(q, ω) − i)/τ. Per unit of acceleration, the rate of the current decreases by (r_q g + r_ω)
+    g/(τ + g). The step matrix contains this decrease.
+    """
+    p, lag = plant.parameters, ELECTRIC_TIME
+    for j in range(5):
+        inertia = p.joint_inertia if j < 2 else p.mass if j < 4 else p.inertia
+        plant.load[j] = plant.forces[j] - 2.0 * inertia * earlier.velocity[j]
+        k.position[j] = now.velocity[j] - 2.0 * earlier.position[j]
+    for j in range(SHEARS):
+        rate = stage.extra_rate[j] - 2.0 * earlier.extra_shear[j]
+        k.extra_shear[j] = rate if plant.has_extra_rows else 0.0
+    for j in range(2):
+        k.shear[j] = stage.on_object[j].shear_rate - 2.0 * earlier.shear[j]
         reference = current_reference(plant, j, now.position[j], now.velocity[j])
         displacement = k.position[j]
-        fall = g * plant.motor_by_q[j] * displacement / constant
-        change = (reference - now.current[j] - 2.0 * lag * k.current[j]) / (lag + g) - fall
+        fall = g * plant.motor_by_q[j] * displacement / p.torque_constant
+        change = (reference - now.current[j] - 2.0 * lag * earlier.current[j]) / (lag + g) - fall
         k.current[j] = change
-        torque = constant * (now.current[j] + g * change)
+        torque = p.torque_constant * (now.current[j] + g * change)
         plant.load[j] += torque - g * joint_stiffness(plant, j) * displacement
 
 
@@ -91,36 +206,17 @@ def load_motors(plant: Plant, now: Motion, k: Motion, g: float) -> None:
 def finish_stage(plant: Plant, k: Motion, g: float) -> None:
     """Solve for the velocities in ``k``, and update the other rates with these velocities."""
     solve(plant, k)
-    if plant.has_extra_rows:
-        add_extra_shears(plant, k, g)
+    for number in range(EXTRA_ROWS if plant.has_extra_rows else 0):
+        extra = plant.extra[number]
+        if extra.shear > 0 and extra.stiffness != 0.0:
+            k.extra_shear[extra.shear - 1] += g * along_extra(extra, k.velocity)
     for j in range(5):
         k.position[j] += g * k.velocity[j]
     for j in range(2):
         tip = plant.stages[0].on_object[j]
-        k.shear[j] += g * along_row(tip, ALONG_SHEAR, j, k.velocity)
+        k.shear[j] += g * along_row(tip, ALONG_SHEAR, k.velocity)
         slope = plant.motor_by_rate[j] + g * plant.motor_by_q[j]
         k.current[j] -= g * slope / plant.parameters.torque_constant * k.velocity[j]
-
-
-@inner_kernel
-def first_stage(plant: Plant, g: float) -> None:
-    """Compute k1 of the step."""
-    stage, state, k = plant.stages[0], plant.state, plant.first
-    for j in range(5):
-        plant.load[j] = plant.forces[j]
-        k.position[j] = state.velocity[j]
-    for j in range(2):
-        k.shear[j] = stage.on_object[j].shear_rate
-        k.current[j] = 0.0
-    for j in range(SHEARS):
-        k.extra_shear[j] = stage.extra_rate[j] if plant.has_extra_rows else 0.0
-    set_motor_slopes(plant, g)
-    load_motors(plant, state, k, g)
-    factorise(plant, g)
-    if plant.has_extra_rows:
-        take_extra_stiffness(plant, k, g)
-    take_stiffness(plant, k, g)
-    finish_stage(plant, k, g)
 
 
 @inner_kernel
@@ -139,24 +235,9 @@ def begin_second_stage(plant: Plant, h: float) -> None:
 
 
 @inner_kernel
-def second_stage(plant: Plant, g: float) -> None:
-    """Compute k2 of the step from the forces of the second stage."""
-    p, stage, first, k = plant.parameters, plant.stages[1], plant.first, plant.second
-    for j in range(5):
-        inertia = p.joint_inertia if j < 2 else p.mass if j < 4 else p.inertia
-        plant.load[j] = plant.forces[j] - 2.0 * inertia * first.velocity[j]
-        k.position[j] = plant.stage_state.velocity[j] - 2.0 * first.position[j]
-    for j in range(2):
-        k.shear[j] = stage.on_object[j].shear_rate - 2.0 * first.shear[j]
-        k.current[j] = first.current[j]
-    for j in range(SHEARS):
-        rate = stage.extra_rate[j] - 2.0 * first.extra_shear[j]
-        k.extra_shear[j] = rate if plant.has_extra_rows else 0.0
-    load_motors(plant, plant.stage_state, k, g)
-    take_stiffness(plant, k, g)
-    if plant.has_extra_rows:
-        take_extra_stiffness(plant, k, g)
-    finish_stage(plant, k, g)
+def bounded(value: float, limit: float) -> float:
+    """Clip ``value`` to ± ``limit``."""
+    return min(max(value, -limit), limit)
 
 
 @inner_kernel
@@ -279,7 +360,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
     h = p.step
     g = _GAMMA * h
     scripted = p.object_held and p.script_speed > 0.0
-    relaxing = p.creep > 0.0 or p.micro_slip
+    relaxing = p.creep > 0.0 or p.tip_micro_slip
     evaluate_state(plant, data)
     open_guard(plant)
     store_bristles(plant)
@@ -292,10 +373,18 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
         plant.last_state = plant.state
         plant.last_layers[:] = plant.layers
         was_on_rim = is_on_rim(plant)
-        first_stage(plant, g)
+        set_motor_slopes(plant, g)
+        factorise(plant, g)
+        begin_stage(plant, state, plant.stages[0], plant.no_motion, plant.first, g)
+        take_extra_stiffness(plant, plant.first, g)
+        take_stiffness(plant, plant.first, g)
+        finish_stage(plant, plant.first, g)
         begin_second_stage(plant, h)
         evaluate_hand(plant, data, plant.stage_state, plant.stages[1], False)
-        second_stage(plant, g)
+        begin_stage(plant, plant.stage_state, plant.stages[1], plant.first, plant.second, g)
+        take_stiffness(plant, plant.second, g)
+        take_extra_stiffness(plant, plant.second, g)
+        finish_stage(plant, plant.second, g)
         advance_state(plant, h)
         plant.step_count += 1
         if scripted:

@@ -75,22 +75,22 @@ class Edge(Record):
 
 
 class Parameters(Record):
-    """Plant parameters computed from the settings."""
+    """Plant parameters. Those with the name of a simulation setting are copies of the setting."""
 
     step: float  # sub-step [s]
     sample_period: float  # [s]
     modulus: float  # modulus of the real tip at zero strain [Pa]
     radius: float  # tip radius [m]
     deepest: float  # maximum d at which the contact law is valid [m]
-    scale: float  # ratio of the real modulus to the modulus of the contact table
-    friction: float
-    loss: float  # ratio of damping to stiffness [s]
-    shear_stiffness: float  # ratio of the shear stiffness to the spring model's shear stiffness
+    modulus_scale: float  # ratio of the real modulus to the modulus of the contact table
+    tip_friction: float
+    tip_loss: float  # ratio of damping to stiffness [s]
+    tip_shear_stiffness: float  # ratio of the shear stiffness to that of the spring model
     shear_coupling: float  # 1 if d_t is coupled with d and θ (springs), else 0 (bristles)
     creep: float  # fraction of the shear that relaxes per sub-step while the tip sticks
-    micro_slip: bool  # True if the edge of the footprint slips first
+    tip_micro_slip: bool  # True if the edge of the footprint slips first
     tips_relax: bool
-    relaxation: FloatTriple  # stiffness of each Prony term relative to the long-term stiffness
+    tip_relaxation: FloatTriple  # stiffness of each Prony term relative to the long-term stiffness
     relaxation_step: FloatTriple  # fraction of each Prony term that relaxes per sub-step
     half_separation: float  # half the distance between the pivots [m]
     length: float  # finger length [m]
@@ -113,10 +113,10 @@ class Parameters(Record):
     joint_inertia: float  # [kg·m²]
     joint_damping: float  # [N·m·s/rad]
     joint_friction: float  # [N·m]
-    stribeck: float  # additional friction at standstill [N·m]
-    load_friction: Pair  # ratio of friction to gear torque, and the ratio's increase at standstill
-    stribeck_speed: float  # speed at which the additional friction has decreased to 1/e [rad/s]
-    presliding: float  # bristle deflection at which the gears slip [rad]
+    joint_stribeck: float  # additional friction at standstill [N·m]
+    joint_load_friction: Pair  # ratio of friction to gear torque, and its increase at standstill
+    joint_stribeck_speed: float  # speed at which the additional friction has fallen to 1/e [rad/s]
+    joint_presliding: float  # bristle deflection at which the gears slip [rad]
     torque_constant: float  # [N·m/A]
     stall_current: float  # [A]
     no_load_speed: float  # [rad/s]
@@ -166,11 +166,7 @@ class Gears(Record):
 
 
 class TipContact(Record):
-    """Contact of one tip with the object or with the other tip.
-
-    The rows of the matrices are d, θ and d_t. The columns are q, x, y and φ. For a tip-to-tip
-    contact, the columns are q1 and q2.
-    """
+    """Contact of one tip with the object or with the other tip."""
 
     d: float  # normal displacement, negative for a gap [m]
     theta: float  # tilt of the object relative to the tip [rad]
@@ -194,11 +190,10 @@ class TipContact(Record):
     rim_energy: float  # rim energy [J], valid only if ``rim`` is above 0
     rim_d: float  # derivatives of the rim energy with respect to d [N] and θ [N·m]
     rim_theta: float
-    rows: Annotated[FloatArray, 3, 4]  # derivatives of d, θ and d_t with respect to the coordinates
+    rows: Annotated[FloatArray, 3, 5]  # derivatives of d, θ and d_t with respect to the coordinates
     stiffness: FloatTriple  # stiffness along each row
     damping: FloatTriple
     along: FloatTriple  # forces along d, θ and d_t, including damping
-    forces: Annotated[FloatArray, 4]  # generalised forces on the coordinates
 
 
 class Stage(Record):
@@ -234,6 +229,7 @@ class Plant(Record):
     limited_step_count: int  # number of sub-steps that the energy guard has limited
     last_state: Motion  # state before the step
     stage_state: Motion  # state of the second stage
+    no_motion: Motion  # zeros
     first: Motion  # k1 of the step
     second: Motion  # k2 of the step
     stages: Annotated[Records[Stage], 2]

@@ -14,12 +14,7 @@ import numpy as np
 
 from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.servos.control_table import (
-    CURRENT_BASED_POSITION_MODE,
-    CURRENT_MODE,
-    POSITION_MODE,
-    by_name,
-)
+from softfinger.daemon.servos.control_table import CURRENT_BASED_POSITION_MODE, by_name
 from softfinger.daemon.simulation.faults import (
     ALL,
     MEASUREMENT_FAULTS,
@@ -39,8 +34,6 @@ from softfinger.kinematics.hand.geometry import HandGeometry
 
 SPARE_SAMPLE_COUNT = 8
 ADVANCE_MAX = 10.0  # maximum simulated time per kernel call [s]
-
-_MODES = (CURRENT_MODE, POSITION_MODE, CURRENT_BASED_POSITION_MODE)
 
 STANDARD_GRAVITY = 9.80665  # m/s²
 STEP_MAX = 0.25e-3  # s
@@ -81,37 +74,44 @@ def stiff_step(settings: Settings, table: ContactTable) -> float:
 
 def set_parameters(p: Parameters, settings: Settings, table: ContactTable, step: float) -> None:
     """Set the plant parameters. Raises SettingsError if the servo is unknown."""
-    simulation = settings.simulation
+    simulation, hand = settings.simulation, settings.hand
+    for name in Parameters.__annotations__.keys() & type(simulation).model_fields.keys():
+        setattr(p, name, getattr(simulation, name))
     p.step = step
     p.sample_period = 1.0 / settings.tactile.rate
     p.modulus = table.header.modulus * simulation.modulus_scale
     p.radius = settings.tip.radius
     p.deepest = table.header.deepest
-    p.scale = simulation.modulus_scale
-    p.friction = simulation.tip_friction
-    p.loss = simulation.tip_loss
-    p.shear_stiffness = simulation.tip_shear_stiffness
     p.shear_coupling = float(simulation.tip_law == "springs")
     if simulation.tip_creep_time > 0.0:
         p.creep = -math.expm1(-step / simulation.tip_creep_time)
-    p.micro_slip = simulation.tip_micro_slip
     p.tips_relax = any(simulation.tip_relaxation)
-    p.relaxation[:] = simulation.tip_relaxation
     p.relaxation_step[:] = [-math.expm1(-step / each) for each in simulation.tip_relaxation_times]
-    p.half_separation = 0.5 * settings.hand.pivot_separation
-    p.length = settings.hand.finger_length
-    p.offset = settings.hand.finger_offset
+    p.half_separation = 0.5 * hand.pivot_separation
+    p.length = hand.finger_length
+    p.offset = hand.finger_offset
     p.finger_present[:] = [name in settings.scene.fingers for name in FINGERS]
-    _object(p, settings)
-    _joints(p, settings)
-    _script(p, settings)
+    p.stop_low[:] = np.subtract(hand.q_min, STOP_CLEARANCE)
+    p.stop_high[:] = np.add(hand.q_max, STOP_CLEARANCE)
+    _set_motors(p, settings)
+    _set_object(p, settings)
 
 
-def _object(p: Parameters, settings: Settings) -> None:
-    simulation = settings.simulation
-    shape, mass = shape_of(settings), simulation.object_mass
-    p.palm = simulation.palm
-    p.palm_friction = simulation.palm_friction
+def _set_motors(p: Parameters, settings: Settings) -> None:
+    servos = settings.servos
+    model, constant = by_name(servos.model), settings.control.torque_constant
+    p.torque_constant = constant
+    p.stall_current = model.stall_current
+    p.no_load_speed = model.no_load_speed / servos.gear_ratio
+    p.position_gain = model.stall_current / FULL_EFFORT_ERROR
+    # This gain makes the position loop critically damped.
+    p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * p.joint_inertia) / constant
+    p.joints_held = servos.backend == "none"
+
+
+def _set_object(p: Parameters, settings: Settings) -> None:
+    simulation, shape = settings.simulation, shape_of(settings)
+    mass, radius = simulation.object_mass, settings.tip.radius
     p.shape = shape.kind
     p.roundness = shape.roundness
     p.extent = shape.extent
@@ -121,12 +121,11 @@ def _object(p: Parameters, settings: Settings) -> None:
         edge.x, edge.y, edge.normal_x, edge.normal_y, edge.length = values
     # Factor κ for a face of this radius; see tip.py.
     curved = shape.roundness
-    p.factor = math.sqrt(curved / (curved + settings.tip.radius)) if curved else 1.0
+    p.factor = math.sqrt(curved / (curved + radius)) if curved else 1.0
     if settings.tip.physics == "solid":
         p.factor = math.sqrt(p.factor)
     p.mass = mass
     p.inertia = mass * shape.gyration**2
-    p.gravity[:] = simulation.gravity
     # The gravity component normal to the plane presses the object onto the table.
     pressing = math.sqrt(max(STANDARD_GRAVITY**2 - math.hypot(*simulation.gravity) ** 2, 0.0))
     p.table_force = simulation.table_friction * mass * pressing
@@ -134,45 +133,16 @@ def _object(p: Parameters, settings: Settings) -> None:
     p.table_spin = TABLE_SPEED / shape.mean_radius
     # A single finger cannot hold an object, so a one-finger scene fixes the object to the test
     # bench.
-    p.object_held = (
-        shape.kind == NO_OBJECT
-        or len(settings.scene.fingers) == 1
-        or (settings.servos.backend == "none" and simulation.compression_speed > 0.0)
-    )
-
-
-def _joints(p: Parameters, settings: Settings) -> None:
-    simulation, servos = settings.simulation, settings.servos
-    model = by_name(servos.model)
-    inertia, constant = simulation.joint_inertia, settings.control.torque_constant
-    p.joint_inertia = inertia
-    p.joint_damping = simulation.joint_damping
-    p.joint_friction = simulation.joint_friction
-    p.stribeck = simulation.joint_stribeck
-    p.load_friction[:] = simulation.joint_load_friction
-    p.stribeck_speed = simulation.joint_stribeck_speed
-    p.presliding = simulation.joint_presliding
-    p.torque_constant = constant
-    p.stall_current = model.stall_current
-    p.no_load_speed = model.no_load_speed / servos.gear_ratio
-    p.position_gain = model.stall_current / FULL_EFFORT_ERROR
-    # This gain makes the position loop critically damped.
-    p.rate_gain = 2.0 * math.sqrt(p.position_gain * constant * inertia) / constant
-    p.stop_low[:] = np.subtract(settings.hand.q_min, STOP_CLEARANCE)
-    p.stop_high[:] = np.add(settings.hand.q_max, STOP_CLEARANCE)
-    p.joints_held = servos.backend == "none"
-
-
-def _script(p: Parameters, settings: Settings) -> None:
-    simulation = settings.simulation
+    scripted = p.joints_held and simulation.compression_speed > 0.0
+    p.object_held = shape.kind == NO_OBJECT or len(settings.scene.fingers) == 1 or scripted
     p.script_x = simulation.object_position[0]
-    if settings.servos.backend != "none":
+    if not scripted:
         return
     p.script_speed = simulation.compression_speed
     pose = (*simulation.object_position, simulation.object_angle)
-    width = 2.0 * shape_of(settings).half_width
+    width = 2.0 * shape.half_width
     contacts = geometry_of(settings).contacts(settings.hand.open_angle, pose, width)
-    ways = COMPRESSION_DEPTH * settings.tip.radius - contacts.d
+    ways = COMPRESSION_DEPTH * radius - contacts.d
     ways = np.maximum(ways / max(math.cos(simulation.object_angle), 0.1), 0.0)
     p.script_travel[:] = ways * p.finger_present
 
@@ -301,12 +271,7 @@ class SimulatedHand:
         """Set a servo's mode, goal angle [rad] and goal current [A]; switch its torque on or off.
 
         The Dynamixel mode numbers are 0 (current), 3 (position) and 5 (current-based position).
-        Raises ValueError for another mode or a non-finite goal.
         """
-        if mode not in _MODES:
-            raise ValueError(f"operating mode {mode} is not simulated; expected one of {_MODES}")
-        if not (math.isfinite(goal_q) and math.isfinite(goal_current)):
-            raise ValueError(f"goals must be finite, got {goal_q!r} rad, {goal_current!r} A")
         self._mode[joint] = mode
         self.torque_on[joint] = torque_on
         self._goal_q[joint] = goal_q
@@ -356,22 +321,13 @@ class SimulatedHand:
             return False
         return True
 
-    def sample(self, number: int) -> Sample:
+    def sample(self, number: int) -> Sample | None:
         """Return sample ``number``, which is valid until a newer sample replaces it.
 
-        Raises LookupError if the sample has not been taken yet or has been overwritten.
+        Returns None if the sample has not been taken yet or has been overwritten.
         """
         row = self._rows[number % len(self._rows)]
-        if row.number != number:
-            raise LookupError(
-                f"sample {number} is not stored; {self.plant.sample_count} samples have been "
-                f"taken, and the latest {len(self._rows)} are stored"
-            )
-        return row
-
-    def energy(self) -> float:
-        """Return the kinetic, elastic and gravitational energy of joints, tips and object [J]."""
-        return self.plant.energy
+        return row if row.number == number else None
 
     def _run(self, count: int) -> None:
         plant.step(self.plant.array, self.table.data, self._ring, count)

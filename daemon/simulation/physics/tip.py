@@ -1,4 +1,4 @@
-"""Compute the contact forces between a soft tip and the object.
+"""Compute the forces of a soft tip from d, θ and d_t, and relax tips and shears.
 
 All elastic forces are derived from a single energy U, so a contact can't create energy:
 
@@ -21,20 +21,17 @@ surfaces slide at the centre of the contact. The force at θ = 0, the normal for
 sensor readings are the same for both laws. A controller that compensates for the tangential terms
 of springs can be tested on a ``"bristles"`` tip, which lacks these terms.
 
-The tip touches the nearest point of the object. On a face, the contact direction is the face
-normal. At a corner, the contact direction is the line to the corner. The corner acts like a plane
-that is normal to the contact direction. On a disc, the contact direction is the line to the disc
-centre. A disc is a cylinder of radius R whose axis is normal to the hand plane. To leading order in
-d, a contact with a disc differs in two ways from a contact with its tangent plane. First, the
-curvatures add up to 1/a + 1/R, so the footprint is narrower along the tilt by the factor κ = √(R/(R
-+ a)). Second, at any θ, the force and energy are κ times the force and energy on the plane.
-Numerical integrals over the springs confirm the factors for a constant modulus, a = 20 mm and d up
-to 8 mm. For R = 20 and 40 mm, the error is at most 1.6 % at θ = 0 and 4.5 % at θ = 30°. For R = 10
-mm, the error is at most 3 % at θ = 0 and 9 % at θ = 30°. `sensor.sensor_model` computes the sensor
-frame directly from the springs. Therefore, the sum of the frame's cells differs from the force by
-the error of the factors. For small d, the force of a solid tip on a disc is proportional to √κ
-d^(3/2), as in Hertz's theory for a sphere on a cylinder. The frame of a solid tip on a disc is √κ
-times the frame of the tip on a plane.
+A disc is a cylinder of radius R whose axis is normal to the hand plane. To leading order in d, a
+contact with a disc differs in two ways from a contact with its tangent plane. First, the curvatures
+add up to 1/a + 1/R, so the footprint is narrower along the tilt by the factor κ = √(R/(R + a)).
+Second, at any θ, the force and energy are κ times the force and energy on the plane. Numerical
+integrals over the springs confirm the factors for a constant modulus, a = 20 mm and d up to 8 mm.
+For R = 20 and 40 mm, the error is at most 1.6 % at θ = 0 and 4.5 % at θ = 30°. For R = 10 mm, the
+error is at most 3 % at θ = 0 and 9 % at θ = 30°. `sensor_model` computes the sensor frame directly
+from the springs. Therefore, the sum of the frame's cells differs from the force by the error of the
+factors. For small d, the force of a solid tip on a disc is proportional to √κ d^(3/2), as in
+Hertz's theory for a sphere on a cylinder. The frame of a solid tip on a disc is √κ times the frame
+of the tip on a plane.
 
 Coulomb friction limits d_t to the range between the two shears at which |T| = μN. The ratio |T|/N
 has a maximum, which is 1 for constant E, s = 1 and θ = 0. If the maximum of |T|/N is below μ, the
@@ -59,18 +56,12 @@ from __future__ import annotations
 
 import math
 
-from softfinger.daemon.simulation.physics.outline import (
-    RIM_STIFFNESS,
-    nearest,
-    rim_on_disc,
-    rim_on_plane,
-)
 from softfinger.daemon.simulation.physics.plant_state import (
     ALONG_D,
     ALONG_SHEAR,
     ALONG_THETA,
     LAYERS,
-    Motion,
+    FloatArray,
     Parameters,
     Plant,
     TipContact,
@@ -80,10 +71,9 @@ from softfinger.kinematics.contact.lookup import lookup_at, normal_at, stiffness
 from softfinger.kinematics.contact.table_record import Table
 
 D_MIN = 1e-9  # minimum d for a contact [m]
+RIM_STIFFNESS = 1e6  # stiffness of the backing plate against the object [N/m]
 _FADE_FROM = 1.15  # angle above which w(θ) decreases [rad]
 _FADE_TO = 1.35  # angle at which w(θ) becomes 0 [rad]
-# Minimum distance from the tip centre to a corner, as a fraction of the radius.
-_CORNER_DISTANCE_MIN = 1e-3
 _FRICTION_TOLERANCE = 5e-13  # relative tolerance for the friction limit
 _RELAXATION_MIN = 0.02  # minimum relaxation factor, for tips with delayed recovery
 # Distance from the end of the soft range to the rim at θ = 0, as a fraction of the tip radius.
@@ -120,6 +110,15 @@ def shear_limit(t1: float, n0: float, n1: float, n2: float, friction: float) -> 
 
 
 @inner_kernel
+def along_row(tip: TipContact, r: int, rates: FloatArray) -> float:
+    """Return the scalar product of a tip's row ``r`` and the ``rates`` of the coordinates."""
+    rate = 0.0
+    for j in range(5):
+        rate += tip.rows[r, j] * rates[j]
+    return rate
+
+
+@inner_kernel
 def clear_contact(tip: TipContact) -> None:
     """Clear a tip's contact, but keep d, θ and the gain."""
     tip.force = 0.0
@@ -133,10 +132,8 @@ def clear_contact(tip: TipContact) -> None:
     for r in range(3):
         tip.stiffness[r] = 0.0
         tip.damping[r] = 0.0
-        for j in range(4):
+        for j in range(5):
             tip.rows[r, j] = 0.0
-    for j in range(4):
-        tip.forces[j] = 0.0
 
 
 @inner_kernel
@@ -209,7 +206,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         slope, slope_d, slope_theta = normal_at(
             table, d_soft, tip.theta, (force, force_d, force_theta), leaning, inverse_cosine
         )
-        scale = p.scale
+        scale = p.modulus_scale
         force *= scale
         force_d *= scale
         force_theta *= scale
@@ -223,7 +220,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         soft_theta = scale * soft_theta + (slope_theta + slope_d * d_soft_theta) * over
 
         # T and N are polynomials in the shear: T = t0 + t1 d_t, N = n0 + n1 d_t + n2 d_t².
-        firm = p.shear_stiffness
+        firm = p.tip_shear_stiffness
         ratio = firm * cosine * inverse_d
         coupled = p.shear_coupling * sine
         t0 = gain * force * coupled
@@ -237,7 +234,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
         # Two comparisons detect contacts that are far from slipping, which is the usual case.
         normal = n0 + shear * (n1 + shear * n2)
         tangential = t0 + t1 * shear
-        friction = p.friction
+        friction = p.tip_friction
         # The tolerance ensures that a limited shear is not limited a second time.
         stuck = friction * normal * (1.0 + _FRICTION_TOLERANCE)
         if abs(tangential) > stuck or curvature * (shear - neutral) ** 2 > at_neutral:
@@ -272,7 +269,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     # virtual work consistent.
     rate_d = tip.rate_d
     rate_t = tip.slip_rate - tangent * rate_d
-    loss = p.loss
+    loss = p.tip_loss
     loss_d = loss * stiffness_d
     if rate_d < 0.0:
         loss_d = min(loss_d, max(normal, 0.0) / -rate_d)
@@ -280,7 +277,7 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
     loss_t = loss * stiffness_t
     if rate_t != 0.0:
         opposed = tangential if rate_t > 0.0 else -tangential
-        loss_max = max(p.friction * normal - opposed, 0.0)
+        loss_max = max(p.tip_friction * normal - opposed, 0.0)
         loss_t = min(loss_t, loss_max / abs(rate_t))
     tip.gain = gain
     tip.tangent = tangent
@@ -308,108 +305,6 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
 
 
 @inner_kernel
-def set_row(tip: TipContact, r: int, q: float, x: float, y: float, rotation: float) -> None:
-    """Set row ``r`` of the Jacobian to the derivatives with respect to (q, x, y, φ)."""
-    tip.rows[r, 0] = q
-    tip.rows[r, 1] = x
-    tip.rows[r, 2] = y
-    tip.rows[r, 3] = rotation
-
-
-@inner_kernel
-def touch_object(
-    plant: Plant, table: Table, tip: TipContact, finger: int, now: Motion, nx: float, ny: float
-) -> None:
-    """Evaluate a finger's ``tip`` on the object in state ``now``; (nx, ny) is the face normal n."""
-    p = plant.parameters
-    its = plant.fingers[finger]
-    rx = its.x - now.position[2]
-    ry = its.y - now.position[3]
-    side = 1.0 - 2.0 * finger
-    radius = p.radius
-    mu, mv, distance, curved = nearest(p, rx * nx + ry * ny, ry * nx - rx * ny)
-    # The vector m points from the tip centre into the object, and t is m rotated by 90°.
-    mx = mu * nx - mv * ny
-    my = mu * ny + mv * nx
-    d = radius - distance
-    # θ is the angle from the tip axis (±cos q, −sin q) to m.
-    ux = side * its.cosine
-    uy = -its.sine
-    cosine = ux * mx + uy * my
-    sine = ux * my - uy * mx
-    theta = math.atan2(sine, cosine)
-    tip.d = d
-    tip.theta = theta
-    tip.sine = sine
-    tip.cosine = cosine
-
-    # Derivatives with respect to (q, x, y, φ). The vector from the tip centre to the contact point
-    # is ``distance`` · m.
-    px = rx + distance * mx
-    py = ry + distance * my
-    rotation_m = my * px - mx * py
-    rotation_t = mx * px + my * py
-    v_m = its.x_q * mx + its.y_q * my
-    v_t = its.y_q * mx - its.x_q * my
-    q_rate = now.velocity[finger]
-    x_rate = now.velocity[2]
-    y_rate = now.velocity[3]
-    rotation_rate = now.velocity[4]
-    rate_d = v_m * q_rate - mx * x_rate - my * y_rate - rotation_m * rotation_rate
-    # The step matrix uses the stiffness at the end of the step, so it remains accurate during an
-    # impact. Damping uses the stiffness at the present position.
-    travel = max(p.step * rate_d, 0.0)
-    if d + travel <= D_MIN:
-        tip.gain = fade(theta)[0] * p.factor * plant.relaxation_factor[finger]
-        clear_contact(tip)
-        return
-    theta_q = side
-    theta_x = 0.0
-    theta_y = 0.0
-    theta_rotation = 1.0
-    if curved >= 0.0:
-        # The vector m points to a fixed point of the object, which is either a corner or the centre
-        # of a disc.
-        inverse = 1.0 / max(distance + curved, _CORNER_DISTANCE_MIN * radius)
-        theta_q -= v_t * inverse
-        theta_x = -my * inverse
-        theta_y = mx * inverse
-        theta_rotation = (rotation_t + curved) * inverse
-    if curved > 0.0:
-        tip.curvature = 1.0 / curved
-        rim_on_disc(p, tip, distance + curved)
-    else:
-        tip.curvature = 0.0
-        rim_on_plane(p, tip)
-    tip.travel = travel
-    tip.rate_d = rate_d
-    tip.rate_theta = (
-        theta_q * q_rate + theta_x * x_rate + theta_y * y_rate + theta_rotation * rotation_rate
-    )
-    # Sliding velocity of the object relative to the tip, along t.
-    t_q = side * distance - v_t
-    tip.slip_rate = t_q * q_rate - my * x_rate + mx * y_rate + rotation_t * rotation_rate
-    tip.shear = now.shear[finger]
-    tip.shear_variance = plant.shear_variance[finger]
-    contact_forces(p, table, tip, p.factor * plant.relaxation_factor[finger])
-    tangent = tip.tangent
-    t_q -= tangent * v_m
-    t_x = -my + tangent * mx
-    t_y = mx + tangent * my
-    t_rotation = rotation_t + tangent * rotation_m
-    set_row(tip, ALONG_D, v_m, -mx, -my, -rotation_m)
-    set_row(tip, ALONG_THETA, theta_q, theta_x, theta_y, theta_rotation)
-    set_row(tip, ALONG_SHEAR, t_q, t_x, t_y, t_rotation)
-    along_d = tip.along[ALONG_D]
-    along_theta = tip.along[ALONG_THETA]
-    along_t = tip.along[ALONG_SHEAR]
-    tip.forces[0] = -(along_d * v_m + along_theta * theta_q + along_t * t_q)
-    tip.forces[1] = along_d * mx - along_theta * theta_x - along_t * t_x
-    tip.forces[2] = along_d * my - along_theta * theta_y - along_t * t_y
-    tip.forces[3] = along_d * rotation_m - along_theta * theta_rotation - along_t * t_rotation
-
-
-@inner_kernel
 def relax_shears(plant: Plant) -> None:
     """Relax the shears after a sub-step, based on the contacts at the start of the sub-step."""
     p, state = plant.parameters, plant.state
@@ -424,8 +319,8 @@ def relax_shears(plant: Plant) -> None:
         neutral = tip.shear - tip.tangential / stiffness
         shear = state.shear[finger]
         shear += p.creep * (neutral - shear)
-        if p.micro_slip:
-            limit = 2.0 * p.friction * max(tip.normal, 0.0) / stiffness
+        if p.tip_micro_slip:
+            limit = 2.0 * p.tip_friction * max(tip.normal, 0.0) / stiffness
             mean = 0.0
             for k in range(LAYERS):
                 mean += layers[k] / LAYERS
@@ -461,7 +356,7 @@ def relax_tips(plant: Plant) -> None:
         for k in range(3):
             state[k] += p.relaxation_step[k] * (lasting - state[k])
             if lasting > 0.0:
-                factor += p.relaxation[k] * (1.0 - state[k] / lasting)
+                factor += p.tip_relaxation[k] * (1.0 - state[k] / lasting)
             else:
-                factor += p.relaxation[k]
+                factor += p.tip_relaxation[k]
         plant.relaxation_factor[finger] = max(factor, _RELAXATION_MIN)

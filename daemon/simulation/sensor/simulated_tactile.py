@@ -169,9 +169,8 @@ class SimulatedTactile:
             if touch.pressure > 0.0:
                 self._model.press_evenly(touch.pressure)
             return True
-        try:
-            sample = self._hand.sample(number)
-        except LookupError:
+        sample = self._hand.sample(number)
+        if sample is None:
             return False
         finger = self._finger
         d, theta = float(sample.d[finger]), float(sample.theta[finger])
