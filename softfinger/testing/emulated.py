@@ -13,16 +13,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT, by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.emulator.folder import carry_out, find_ports
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.faults import ALL, SERVOS, FaultError, parse_faults
-from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo, prepared
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.tools.processes.emulate import emulator_process
+
+FloatArray = NDArray[np.float64]
 
 _SERVOS_MAX = 8
 _LOOK = 0.005  # interval between checks for changes made by another thread [s]
@@ -97,6 +101,81 @@ class EmulatedHand:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class FreeJoints:
+    """``count`` independent joints for servos without a hand, initially at rest at angle 0.
+
+    This class implements :class:`JointPlant`. Each joint has inertia, viscous friction and Coulomb
+    friction. The servo's position loop commands the current, which responds with a first-order lag.
+    A fixed step makes runs deterministic. The constants approximate an XM430-W350 with a bare horn.
+    """
+
+    STEP = 0.0005  # s
+    INERTIA = 0.002  # rotor inertia reflected to the gearbox output [kg·m²]
+    VISCOUS = 0.05  # N·m·s/rad
+    COULOMB = 0.02  # N·m
+    TORQUE_CONSTANT = 1.78  # N·m/A
+    CURRENT_LAG = 0.001  # s
+    STIFFNESS = 8.0  # A/rad
+    DAMPING = 0.10  # A·s/rad
+    STALL = 3.21  # stall current at full supply voltage [A]
+
+    def __init__(self, count: int = 2, start: float = 0.0) -> None:
+        self._start = start
+        self._done = 0  # number of steps since the start
+        self.q: NDArray[np.float64] = np.zeros(
+            count
+        )  # joint angles [rad]; callers may change the angles
+        self.dq: NDArray[np.float64] = np.zeros(count)  # rad/s
+        self.current: NDArray[np.float64] = np.zeros(count)  # A
+        # Torque-on flag, signed current, angle, and current limit of each joint.
+        self._goals = [(False, 0.0, 0.0, 0.0)] * count
+        # Stiffness, damping and duty of each joint; see `tune`.
+        self._tuned = [(1.0, 0.0, 1.0)] * count
+
+    def measured_current(self, joint: int) -> float:
+        """Return the measured current; see :meth:`JointPlant.measured_current`."""
+        return self.current.item(joint)
+
+    def advance(self, t: float) -> None:
+        """Advance to time t [s]."""
+        count = int((t - self._start) / self.STEP + 1e-9) - self._done
+        if count > 0:
+            self._done += count
+            for joint in range(len(self.q)):
+                self._advance(joint, count)
+
+    def drive(
+        self, joint: int, mode: int, torque_on: bool, goal_q: float, goal_current: float
+    ) -> None:
+        """Set a servo's mode and goals; see :meth:`JointPlant.drive`."""
+        if mode == 0:
+            self._goals[joint] = torque_on, goal_current, 0.0, 0.0
+        else:
+            self._goals[joint] = torque_on, 0.0, goal_q, abs(goal_current)
+
+    def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
+        """Set a servo's gains and PWM limit; see :meth:`JointPlant.tune`."""
+        self._tuned[joint] = stiffness, damping, duty
+
+    def _advance(self, joint: int, count: int) -> None:
+        q, dq, current = (float(each[joint]) for each in (self.q, self.dq, self.current))
+        torque_on, fixed, goal, bound = self._goals[joint]
+        stiffness, damping, duty = self._tuned[joint]
+        step, inertia, most = self.STEP, self.INERTIA, self.STALL * duty
+        stiffness, damping = self.STIFFNESS * stiffness, self.DAMPING + self.STIFFNESS * damping
+        slow = self.COULOMB * step / inertia
+        for _ in range(count):
+            wanted = min(max(stiffness * (goal - q) - damping * dq, -bound), bound) + fixed
+            wanted = min(max(wanted, -most), most)
+            change = (wanted - current) * step / self.CURRENT_LAG
+            current = current + change if torque_on else 0.0
+            dq += self.TORQUE_CONSTANT * current * step / inertia
+            dq /= 1.0 + self.VISCOUS * step / inertia
+            dq -= min(max(dq, -slow), slow)
+            q += dq * step
+        self.q[joint], self.dq[joint], self.current[joint] = q, dq, current
 
 
 def free_servos(

@@ -18,10 +18,9 @@ from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.port import SerialPort
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import PacketParser, frame
-from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
-from softfinger.testing.emulated import EmulatedBus, free_servos
+from softfinger.testing.emulated import EmulatedBus, FreeJoints, free_servos
 
 RADIAN = 2.0 * math.pi / COUNTS_PER_TURN
 

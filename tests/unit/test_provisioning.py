@@ -22,8 +22,8 @@ from softfinger.daemon.servos.provisioning import (
     provision,
     search,
 )
-from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.testing.emulated import FreeJoints
 from tests.harness.servos import DirectPort
 
 MODEL = by_name("XM430-W350")

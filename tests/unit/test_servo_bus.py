@@ -10,8 +10,8 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, PacketParser, frame
-from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.testing.emulated import FreeJoints
 from tests.fuzz.servo_bus import fuzz
 from tests.harness.servos import RADIAN, BusClient, hand_bus, make_bus
 

@@ -18,9 +18,9 @@ from softfinger.daemon.servos.base import Servos, make_servos
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.joint import current_toward
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.servo_model.free_joints import FreeJoints
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from softfinger.daemon.types import Goal, Reading
+from softfinger.testing.emulated import FreeJoints
 from tests.harness.plant import PAPER
 from tests.harness.servos import RADIAN, DirectPort
 
