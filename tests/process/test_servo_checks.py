@@ -239,8 +239,8 @@ def test_temperature_and_supply_are_read_with_the_joints(bus, servos):
     assert reading.valid
     assert reading.temperature == [25.0, 25.0]
     assert reading.voltage == pytest.approx([12.75, 12.75], abs=0.06)
-    bus.call(lambda: bus.servo(1).health.heat.warm(55.0))
-    bus.call(lambda: setattr(bus.servo(0).health, "supply", 11.0))
+    bus.call(lambda: bus.servo(1).heat.warm(55.0))
+    bus.call(lambda: setattr(bus.servo(0), "supply", 11.0))
     until(lambda: read(servos, reading).temperature[1] > 54.0)
     assert reading.voltage[0] == pytest.approx(11.0)
     assert reading.temperature[0] == 25.0

@@ -13,8 +13,8 @@ from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST
-from softfinger.daemon.simulation.servo_model.servo import REBOOT_TIME
-from softfinger.daemon.simulation.servo_model.servo_joint import OVERLOAD_TIME, Profile
+from softfinger.daemon.simulation.servo_model.servo import OVERLOAD_TIME, REBOOT_TIME
+from softfinger.daemon.simulation.servo_model.servo_joint import Profile
 from tests.harness.servos import RADIAN, BusClient
 
 

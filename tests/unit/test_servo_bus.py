@@ -86,8 +86,8 @@ def test_published_write_exchanges() -> None:
 
 def test_published_bulk_read_and_bulk_write() -> None:
     bus = make_bus()
-    bus.servos[0].health.supply = 11.9
-    bus.servos[1].health.heat.warm(36.0)
+    bus.servos[0].supply = 11.9
+    bus.servos[1].heat.warm(36.0)
     assert bus.feed(hexes("FFFFFD00FE0D00 92 0190000200 0292000100 1A05"), 0.0) == hexes(
         "FFFFFD00010600 55 00 7700 C369", "FFFFFD00020500 55 00 24 8BA9"
     )
@@ -101,7 +101,7 @@ def test_published_bulk_read_and_bulk_write() -> None:
 
 def test_published_fast_bulk_read() -> None:
     bus = make_bus("XC330-T288", (3, 7, 4), counts=(166, 0, 0))
-    bus.servos[2].health.heat.warm(31.0)
+    bus.servos[2].heat.warm(31.0)
     pwm = bus.servos[1]
     pwm.table.set(reg.TORQUE_ENABLE, 1)
     bus.plant.current[1] = 421 / 885 * pwm.model.stall_current

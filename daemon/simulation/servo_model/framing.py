@@ -95,14 +95,13 @@ class PacketParser:
 
     def __init__(self, gap: float = 0.0015) -> None:
         self.gap = gap
-        self.dropped = 0  # number of discarded bytes
         self._buffer = bytearray()
         self._last = 0.0
 
     def feed(self, data: bytes, t: float) -> list[Packet]:
         """Return the packets completed by ``data``, which arrived at time t [s]."""
         if t - self._last > self.gap:
-            self._drop(len(self._buffer))
+            self._buffer.clear()
         self._last = t
         self._buffer += data
         return list(iter(self._next, None))
@@ -111,10 +110,6 @@ class PacketParser:
         """Discard an incomplete packet."""
         self._buffer.clear()
 
-    def _drop(self, count: int) -> None:
-        self.dropped += count
-        del self._buffer[:count]
-
     def _next(self) -> Packet | None:
         buffer = self._buffer
         while True:
@@ -122,22 +117,22 @@ class PacketParser:
             if start < 0:
                 # Keep bytes that may be the start of a header.
                 keep = next((n for n in (3, 2, 1) if buffer.endswith(_PREFIX[:n])), 0)
-                self._drop(len(buffer) - keep)
+                del buffer[: len(buffer) - keep]
                 return None
-            self._drop(start)
+            del buffer[:start]
             if len(buffer) < 7:
                 return None
             packet_id = buffer[4]
             length = buffer[5] | buffer[6] << 8
             if packet_id in (0xFD, 0xFF) or not 3 <= length <= MAX_LENGTH - 7:
-                self._drop(len(HEADER))
+                del buffer[: len(HEADER)]
                 continue
             end = 7 + length
             body = bytes(buffer[7 : end - 2])
             if len(buffer) > end - 2:
                 body += b"\0"  # A header at the end of the body counts as unstuffed.
             if intruder := _UNSTUFFED.search(body):
-                self._drop(7 + intruder.start())
+                del buffer[: 7 + intruder.start()]
                 continue
             if len(buffer) < end:
                 return None

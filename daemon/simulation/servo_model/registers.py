@@ -178,10 +178,6 @@ class ControlTable:
 
     # --- reading ---------------------------------------------------------------------------------
 
-    def holds(self, address: int, length: int) -> bool:
-        """Return True if the address range is inside the table."""
-        return length > 0 and address + length <= self.size
-
     def resolve(self, address: int) -> int:
         """Resolve the address of a byte. An indirect data byte refers to another address."""
         pointer = self._indirect.get(address)
@@ -206,8 +202,6 @@ class ControlTable:
         read-only or undefined. The error is DATA_RANGE if a value is outside the item's range. If
         there is an error, the caller must not change any item.
         """
-        if not data:
-            return framing.DATA_LENGTH, []
         if address + len(data) > self.size:
             return framing.ACCESS, []
         places = [self.resolve(address + i) for i in range(len(data))]

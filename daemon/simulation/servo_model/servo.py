@@ -25,18 +25,18 @@ from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 from softfinger.daemon.simulation.servo_model.servo_joint import (
     POSITION_MODES,
-    SENSE_INTERVAL,
     STEP_TIME,
-    ServoHealth,
     ServoHeat,
     ServoJoint,
 )
 
+OVERLOAD_TIME = 2.0  # time at the current limit after which an overload error occurs [s]
+SENSE_INTERVAL = 0.010  # interval between checks of heat, voltage and overload [s]
 REBOOT_TIME = 0.34  # duration of a reboot, during which the servo does not reply [s]
 JUMP_COUNTS = 130  # jump of the encoder zero [counts], equal to 0.2 rad at the shaft
 FAR_GOAL = 0.05  # distance from the joint angle above which a goal counts as far [rad]
 _WATCHED_REGISTERS = frozenset((reg.GOAL_CURRENT, reg.GOAL_POSITION))
-_TUNING_REGISTERS = (reg.PWM_LIMIT, reg.POSITION_D_GAIN, reg.POSITION_P_GAIN, reg.GOAL_PWM)
+_VOLTAGE = 0  # bit number in the hardware error status
 _CLEAR_FIRMWARE = 42
 _CLEAR_KEY = b"\x01DXL\x22"
 
@@ -50,10 +50,10 @@ def prepared(model: ServoModel, mode: int) -> dict[int, int]:
 class EmulatedServo:
     """Emulated servo that drives joint number ``joint`` of ``plant``.
 
-    All registers have factory defaults except for the ``eeprom`` values. ``health`` may be set
-    externally. A ``silent`` servo ignores all packets and sends no replies. In a ``frozen`` servo,
-    the measured values and the clock stay constant. If ``refuses`` is set, the servo replies to
-    every read with an error.
+    All registers have factory defaults except for the ``eeprom`` values. ``heat`` and the no-load
+    voltage ``supply`` [V] may be changed externally. A ``silent`` servo ignores all packets and
+    sends no replies. In a ``frozen`` servo, the measured values and the clock stay constant. If
+    ``refuses`` is set, the servo replies to every read with an error.
     """
 
     def __init__(
@@ -74,7 +74,10 @@ class EmulatedServo:
         self.table = ControlTable(model, self.firmware)
         self._memory = self.table.memory
         self.silent = self.frozen = self.refuses = False
-        self.health = ServoHealth(model, heat)
+        self.heat = ServoHeat(model) if heat is None else heat
+        self.supply = model.supply
+        self._drawn = 0.0  # motor current at the last check [A]
+        self._overload = 0.0  # time at the current limit [s]
         self._joint = ServoJoint(model, self.table, plant, joint, scale)
         self.recorder = BusRecorder(t)
         self._watched = 0.0  # time when the watchdog was last restarted
@@ -192,12 +195,12 @@ class EmulatedServo:
     def read(self, address: int, length: int, t: float) -> bytes | None:
         """Return the bytes of an address range, or None if the servo rejects the read."""
         table = self.table
-        if self.refuses or not table.holds(address, length):
+        if self.refuses or not 0 < length <= table.size - address:
             return None
         if not self.frozen and table.reads(
             address, length, reg.REALTIME_TICK, reg.PRESENT_TEMPERATURE
         ):
-            self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
+            self._refresh(t)
         return table.read(address, length)
 
     def write(self, address: int, data: bytes, t: float) -> int:
@@ -263,7 +266,7 @@ class EmulatedServo:
             return framing.INSTRUCTION_ERROR
         if parameters != _CLEAR_KEY:
             return framing.DATA_RANGE
-        self._joint.refresh(t - self._booted, self.health.voltage, self.health.heat.sensed)
+        self._refresh(t)
         if self._memory[reg.MOVING]:
             return framing.RESULT_FAIL
         shift = self._joint.forget_turns()
@@ -294,11 +297,11 @@ class EmulatedServo:
             case "reboot":
                 self.reboot(t)
             case "overheat":
-                self.health.heat.warm(self.table.get(reg.TEMPERATURE_LIMIT) + 5.0)
+                self.heat.warm(self.table.get(reg.TEMPERATURE_LIMIT) + 5.0)
             case "overload":
                 self._fail(reg.OVERLOAD)
             case "undervoltage":
-                self.health.supply = (self.model.voltage_min - 10) * reg.VOLTAGE_UNIT
+                self.supply = (self.model.voltage_min - 10) * reg.VOLTAGE_UNIT
             case "stuck":
                 self._joint.stuck = self._joint.encoder()
             case "jump":
@@ -308,7 +311,8 @@ class EmulatedServo:
             case "refuse":
                 self.refuses = True
             case "recover":
-                self.health.recover()
+                self.heat.warm(self.heat.ambient)
+                self.supply = self.model.supply
                 self.frozen = self.refuses = False
                 self._joint.stuck, self._joint.shift = None, 0
 
@@ -328,8 +332,6 @@ class EmulatedServo:
             self._joint.aim()
         elif address == reg.BUS_WATCHDOG:
             self._watched = t
-        elif address in _TUNING_REGISTERS:
-            self._joint.tune()
 
     def _reset_mode(self) -> None:
         table = self.table
@@ -349,13 +351,12 @@ class EmulatedServo:
         if self.model.senses_current:
             table.set(reg.GOAL_CURRENT, table.get(reg.CURRENT_LIMIT))
         table.set(reg.GOAL_POSITION, self._joint.position())
-        self._joint.tune()
 
     def _start(self, t: float) -> None:
         """Start up after power-up or reboot."""
         table = self.table
         table.reset(first=reg.RAM)
-        self.health.overload = 0.0
+        self._overload = 0.0
         self._booted = self._watched = t
         self._joint.forget_turns()
         self._registered = None
@@ -382,11 +383,31 @@ class EmulatedServo:
         self._joint.hold()
         self._joint.drive()
 
+    def _refresh(self, t: float) -> None:
+        self._joint.refresh(t - self._booted, self._voltage, self.heat.sensed)
+
+    @property
+    def _voltage(self) -> float:
+        """Supply voltage [V] at the present motor current."""
+        return self.supply - reg.SAG * self._drawn
+
     def _sense(self) -> None:
-        current = self._joint.current
-        pressed = self.torque_on and current >= 0.99 * self._joint.current_limit
-        for bit in self.health.sense(self.table, current, pressed):
-            self._fail(bit)
+        """Advance heat and overload by SENSE_INTERVAL, and set the resulting hardware errors.
+
+        The manuals do not specify when an overload error occurs. In the emulation, an overload
+        error occurs after OVERLOAD_TIME at the configured current limit.
+        """
+        table, self._drawn = self.table, self._joint.current
+        at_limit = self.torque_on and self._drawn >= 0.99 * self._joint.current_limit
+        self._overload = self._overload + SENSE_INTERVAL if at_limit else 0.0
+        self.heat.step(self._drawn, SENSE_INTERVAL)
+        if self.heat.sensed > table.get(reg.TEMPERATURE_LIMIT):
+            self._fail(reg.OVERHEATING)
+        low, high = table.get(reg.MIN_VOLTAGE_LIMIT), table.get(reg.MAX_VOLTAGE_LIMIT)
+        if not low <= round(self._voltage / reg.VOLTAGE_UNIT) <= high:
+            self._fail(_VOLTAGE)
+        if self._overload >= OVERLOAD_TIME:
+            self._fail(reg.OVERLOAD)
 
     def _fail(self, bit: int) -> None:
         """Set a hardware error and its alert bit.
@@ -409,14 +430,11 @@ class BusRecorder:
     def __init__(self, t: float) -> None:
         self._goals: dict[int, tuple[int, int]] = {}  # minimum and maximum goal of each register
         self._refused = 0
-        self._torque_on = 0  # number of torque-on events
-        self._torque_t: float | None = None
-        self._far = 0
-        self._farthest = 0.0  # rad
+        # Fields of the report.
+        self._torque_on: dict[str, Any] = {"count": 0, "t": None, "far": 0, "farthest": 0.0}
+        self._watchdog_fired: dict[str, Any] = {"count": 0, "t": None}
         self._last = t  # time of the last packet
         self._quiet = 0.0  # longest silence while torque is on [s]
-        self._fired = 0
-        self._fired_t: float | None = None
 
     def goals(self, values: dict[int, int], joint: ServoJoint, torque: bool, refused: bool) -> None:
         """Record the goals in a write. While torque is off, ignore goals near the present angle."""
@@ -431,12 +449,13 @@ class BusRecorder:
 
     def torque_on(self, t: float, joint: ServoJoint, mode: int, position: int) -> None:
         """Record that torque was switched on at time t with the goal ``position`` [counts]."""
-        self._torque_on += 1
-        self._torque_t = self._last = t
+        record = self._torque_on
+        record["count"] += 1
+        record["t"] = self._last = t
         if mode in POSITION_MODES:
             away = _away(joint, position)
-            self._far += away > FAR_GOAL
-            self._farthest = max(self._farthest, away)
+            record["far"] += away > FAR_GOAL
+            record["farthest"] = max(record["farthest"], away)
 
     def heard(self, t: float, torque: bool) -> None:
         """Record a valid packet at time t."""
@@ -446,8 +465,7 @@ class BusRecorder:
 
     def fired(self, t: float) -> None:
         """Record that the bus watchdog has stopped the motor."""
-        self._fired += 1
-        self._fired_t = t
+        self._watchdog_fired = {"count": self._watchdog_fired["count"] + 1, "t": t}
 
     def report(self, t: float, joint: ServoJoint, torque: bool) -> dict[str, Any]:
         """Return the record at time t in JSON format, with SI units and joint coordinates."""
@@ -458,15 +476,10 @@ class BusRecorder:
             "goal_q": sorted(angles) or None,
             "goal_current": sorted(currents) or None,
             "goals_refused": self._refused,
-            "torque_on": {
-                "count": self._torque_on,
-                "t": self._torque_t,
-                "far": self._far,
-                "farthest": self._farthest,
-            },
+            "torque_on": dict(self._torque_on),
             "quiet": quiet if torque else None,
             "longest_quiet": max(self._quiet, quiet) if torque else self._quiet,
-            "watchdog_fired": {"count": self._fired, "t": self._fired_t},
+            "watchdog_fired": self._watchdog_fired,
         }
 
 

@@ -341,14 +341,13 @@ def _execute(servo: EmulatedServo, instruction: int, data: bytes, t: float) -> t
             address, length = _SPAN.unpack(data)
             values = servo.read(address, length, t)
             return (framing.ACCESS, b"") if values is None else (framing.OK, values)
-        case framing.WRITE:
+        case framing.WRITE | framing.REG_WRITE:
             if len(data) < 3:
                 return framing.DATA_LENGTH, b""
-            return servo.write(data[0] | data[1] << 8, data[2:], t), b""
-        case framing.REG_WRITE:
-            if len(data) < 3:
-                return framing.DATA_LENGTH, b""
-            return servo.register(data[0] | data[1] << 8, data[2:]), b""
+            address, values = data[0] | data[1] << 8, data[2:]
+            if instruction == framing.REG_WRITE:
+                return servo.register(address, values), b""
+            return servo.write(address, values, t), b""
         case framing.ACTION:
             return servo.action(t), b""
         case framing.FACTORY_RESET:

@@ -2,9 +2,6 @@
 
 `ServoJoint` converts counts to angles, follows the motion profile, and drives the plant in the
 selected operating mode. `ServoJoint` also writes the measured values to the control table.
-`ServoHealth` models heat (`ServoHeat`), supply voltage and overload. The manuals do not specify
-when an overload error occurs. In the emulation, an overload error occurs after OVERLOAD_TIME at the
-configured current limit.
 """
 
 from __future__ import annotations
@@ -21,9 +18,6 @@ from softfinger.daemon.servos.joint import JointScale
 from softfinger.daemon.simulation.servo_model.registers import ControlTable
 
 STEP_TIME = 0.001  # time step for trajectories and velocity mode [s]
-OVERLOAD_TIME = 2.0  # time at the current limit after which an overload error occurs [s]
-SENSE_INTERVAL = 0.010  # interval between checks of heat, voltage and overload [s]
-_VOLTAGE = 0  # bit number in the hardware error status
 POSITION_MODES = (
     reg.POSITION_MODE,
     reg.EXTENDED_POSITION_MODE,
@@ -149,29 +143,26 @@ class ServoJoint:
 
     # --- plant -------------------------------------------------------------------------------
 
-    def tune(self) -> None:
-        """Pass the values of the gain and PWM registers to the plant, except for the integral gain.
+    def drive(self) -> None:
+        """Drive the plant according to the registers, except for the integral gain.
 
         The servo torque is K_P·error − K_D·Δposition, where Δposition is the change per
         millisecond. According to the e-Manual (position PID gain), K_P = P / 128 and K_D = D / 16.
         """
-        get, (d, _, p) = self._table.get, self._model.position_gains
+        memory, get, drive = self._memory, self._table.get, self._plant.drive
+        d, _, p = self._model.position_gains
         stiffness = get(reg.POSITION_P_GAIN) / p
         damping = (get(reg.POSITION_D_GAIN) - d) / 16.0 / (p / 128.0) * STEP_TIME
         duty = min(abs(get(reg.GOAL_PWM)), get(reg.PWM_LIMIT)) / 885.0
         self._plant.tune(self._joint, stiffness, damping, duty)
-
-    def drive(self) -> None:
-        """Drive the plant according to the registers."""
-        memory, table, drive = self._memory, self._table, self._plant.drive
         mode, goal = memory[reg.OPERATING_MODE], self.goal_angle(self.profile.position)
         if not memory[reg.TORQUE_ENABLE]:
             drive(self._joint, reg.CURRENT_MODE, False, 0.0, 0.0)
         elif mode == reg.CURRENT_BASED_POSITION_MODE:
-            bound = abs(table.get(reg.GOAL_CURRENT)) * self._model.current_unit
+            bound = abs(get(reg.GOAL_CURRENT)) * self._model.current_unit
             drive(self._joint, mode, True, goal, bound)
         elif mode == reg.CURRENT_MODE:
-            drive(self._joint, mode, True, 0.0, self.goal_current(table.get(reg.GOAL_CURRENT)))
+            drive(self._joint, mode, True, 0.0, self.goal_current(get(reg.GOAL_CURRENT)))
         else:
             drive(self._joint, reg.POSITION_MODE, True, goal, self.current_limit)
 
@@ -329,45 +320,3 @@ class ServoHeat:
             self.winding += (heat - inward) * dt / self._winding
             self.sensed += (self.case - self.sensed) * dt / _THERMOMETER_LAG
             self.case += (inward - outward) * dt / self._case
-
-
-class ServoHealth:
-    """Supply voltage, heat and overload of a servo.
-
-    ``heat`` and the no-load voltage ``supply`` [V] may be changed externally.
-    """
-
-    def __init__(self, model: ServoModel, heat: ServoHeat | None = None) -> None:
-        self._model = model
-        self.heat = ServoHeat(model) if heat is None else heat
-        self.overload = 0.0  # time at the current limit [s]
-        self._current = 0.0  # A
-        self.recover()
-
-    def recover(self) -> None:
-        """Cool the motor to ambient temperature and restore the supply voltage."""
-        self.heat.warm(self.heat.ambient)
-        self.supply = self._model.supply
-
-    @property
-    def voltage(self) -> float:
-        """Supply voltage [V] at the present servo current."""
-        return self.supply - reg.SAG * self._current
-
-    def sense(self, table: ControlTable, current: float, pressed: bool) -> list[int]:
-        """Advance by SENSE_INTERVAL and return the bits of all active hardware errors.
-
-        ``pressed`` is True if ``current`` [A] is at the configured limit.
-        """
-        self._current = abs(current)
-        self.heat.step(current, SENSE_INTERVAL)
-        self.overload = self.overload + SENSE_INTERVAL if pressed else 0.0
-        errors = []
-        if self.heat.sensed > table.get(reg.TEMPERATURE_LIMIT):
-            errors.append(reg.OVERHEATING)
-        low, high = table.get(reg.MIN_VOLTAGE_LIMIT), table.get(reg.MAX_VOLTAGE_LIMIT)
-        if not low <= round(self.voltage / reg.VOLTAGE_UNIT) <= high:
-            errors.append(_VOLTAGE)
-        if self.overload >= OVERLOAD_TIME:
-            errors.append(reg.OVERLOAD)
-        return errors
