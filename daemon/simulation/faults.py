@@ -10,7 +10,6 @@ import math
 import random
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, fields
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -28,21 +27,16 @@ ALL = "all"
 LATE_REPLY_DELAY = 0.010  # s
 
 
-@dataclass(slots=True)
-class LineFaults:
-    """Probabilities (0 to 1) of faults on the servo line, and the delay of all replies."""
-
-    lose: float = 0.0  # probability that an instruction is lost
-    lose_writes: float = 0.0  # additional probability of losing an instruction that is not a read
-    drop: float = 0.0  # probability that a reply is lost
-    late: float = 0.0  # probability that a reply is delayed by LATE_REPLY_DELAY
-    truncate: float = 0.0  # probability that the end of a reply is missing
-    corrupt: float = 0.0  # probability that one bit of a reply is flipped
-    duplicate: float = 0.0  # probability that a reply is sent twice
-    delay: float = 0.0  # delay of all replies, as with a slow adapter [s]
-
-
-LINE_FAULTS = tuple(field.name.replace("_", "-") for field in fields(LineFaults))
+LINE_FAULTS = (
+    "lose",  # probability that an instruction is lost
+    "lose-writes",  # additional probability of losing an instruction that is not a read
+    "drop",  # probability that a reply is lost
+    "late",  # probability that a reply is delayed by LATE_REPLY_DELAY
+    "truncate",  # probability that the end of a reply is missing
+    "corrupt",  # probability that one bit of a reply is flipped
+    "duplicate",  # probability that a reply is sent twice
+    "delay",  # delay of all replies, as with a slow adapter [s]
+)
 _DELAY_MAX = 1.0  # s
 _SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
 SERVO_FAULTS = ("silent", "answer", "reboot", *_SERVO_FAILURES, "recover")
@@ -60,66 +54,54 @@ WELL = "well"
 
 
 class FaultSource:
-    """Generator of random line faults that are reproducible for a given seed."""
+    """Generator of random line faults that are reproducible for a given seed.
+
+    ``rates`` contains the probability or delay of each of LINE_FAULTS.
+    """
 
     def __init__(self, seed: int = 1) -> None:
-        self.rates = LineFaults()
+        self.rates = dict.fromkeys(LINE_FAULTS, 0.0)
         self._random = random.Random(seed)
-
-    @property
-    def active(self) -> bool:
-        """True if replies may be lost, corrupted or delayed."""
-        rates = self.rates
-        damage = rates.drop or rates.late or rates.truncate or rates.corrupt or rates.duplicate
-        return bool(damage or rates.delay)
 
     def loses(self, reads: bool) -> bool:
         """Return True if the next instruction is lost; ``reads`` is True for a read instruction."""
-        rates = self.rates
-        if rates.lose and self._random.random() < rates.lose:
-            return True
-        return bool(not reads and rates.lose_writes and self._random.random() < rates.lose_writes)
+        kinds = LINE_FAULTS[:1] if reads else LINE_FAULTS[:2]
+        rates = [self.rates[kind] for kind in kinds if self.rates[kind]]
+        return any(self._random.random() < rate for rate in rates)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
         """Apply faults to a reply and return the bytes to send, each with its extra delay [s]."""
         rates, chance = self.rates, self._random.random
-        if chance() < rates.drop:
+        if not any(rates[kind] for kind in LINE_FAULTS[2:]):
+            return [(0.0, reply)]
+        if chance() < rates["drop"]:
             return []
-        delay = rates.delay + (LATE_REPLY_DELAY if chance() < rates.late else 0.0)
-        if chance() < rates.truncate:
+        delay = rates["delay"] + (LATE_REPLY_DELAY if chance() < rates["late"] else 0.0)
+        if chance() < rates["truncate"]:
             reply = reply[: self._random.randrange(len(reply))]
-        if reply and chance() < rates.corrupt:
+        if reply and chance() < rates["corrupt"]:
             bit = self._random.randrange(8 * len(reply))
             damaged = bytearray(reply)
             damaged[bit // 8] ^= 1 << bit % 8
             reply = bytes(damaged)
-        copies = 2 if chance() < rates.duplicate else 1
+        copies = 2 if chance() < rates["duplicate"] else 1
         return [(delay, reply)] * copies
 
 
 REPLAY_TIME_MAX = 3.0  # s
 
 
-class MeasurementFault(NamedTuple):
-    """Neutral value and limits of one type of measurement fault."""
-
-    honest: float
-    low: float
-    high: float
-
-
-MEASUREMENT_FAULTS = {
-    "gain": MeasurementFault(1.0, 0.0, 100.0),  # factor applied to all pressures
+MEASUREMENT_FAULTS = {  # neutral value, minimum and maximum
+    "gain": (1.0, 0.0, 100.0),  # factor applied to all pressures
     # Shift of the image towards higher column numbers, in cells. The gap is filled with zeros.
-    "shift-x": MeasurementFault(0.0, -255.0, 255.0),
-    "shift-y": MeasurementFault(0.0, -255.0, 255.0),  # shift towards higher row numbers, in cells
-    "mirror": MeasurementFault(0.0, 0.0, 1.0),  # A value of 1 reverses the column order.
-    # Offset added to all cells, as a fraction of the maximum count.
-    "drift": MeasurementFault(0.0, -1.0, 1.0),
-    "replay": MeasurementFault(0.0, 0.0, REPLAY_TIME_MAX),  # duration of the repeated sequence [s]
-    "current": MeasurementFault(1.0, -100.0, 100.0),  # factor applied to the measured current
+    "shift-x": (0.0, -255.0, 255.0),
+    "shift-y": (0.0, -255.0, 255.0),  # shift towards higher row numbers, in cells
+    "mirror": (0.0, 0.0, 1.0),  # A value of 1 reverses the column order.
+    "drift": (0.0, -1.0, 1.0),  # offset added to all cells, as a fraction of the maximum count
+    "replay": (0.0, 0.0, REPLAY_TIME_MAX),  # duration of the repeated sequence [s]
+    "current": (1.0, -100.0, 100.0),  # factor applied to the measured current
 }
-SWITCHED_FAULTS = ("mirror", "replay")  # faults that are either on or off
+_SWITCHED_FAULTS = ("mirror", "replay")  # faults that are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
@@ -137,11 +119,8 @@ class FaultEvent(NamedTuple):
 
     def __str__(self) -> str:
         if self.kind == WELL:
-            return (
-                "all faults have ended"
-                if self.part == ALL
-                else f"{self.part}: all faults have ended"
-            )
+            prefix = "" if self.part == ALL else f"{self.part}: "
+            return f"{prefix}all faults have ended"
         value = "" if self.kind in _PORT_FAULTS else f"={self.value:g}"
         over = f" within {self.over:g} s" * bool(self.over)
         return f"fault: {self.part}: {self.kind}{value}{over}"
@@ -154,23 +133,7 @@ class _Form(NamedTuple):
     value: str  # syntax of the value, in brackets if optional, empty if no value is allowed
     parts: tuple[str, ...]  # affected parts if the word does not name a finger
     sided: bool = False  # True if the word may name a finger
-
-    def fits(self, side: str | None, kind: str, valued: bool) -> bool:
-        """Return True if a fault word may belong to this group."""
-        optional = self.value.startswith("[")
-        return (
-            kind in self.kinds
-            and (self.sided or side is None)
-            and (optional or valued == bool(self.value))
-        )
-
-    def bounds(self, kind: str) -> tuple[float, float]:
-        """Return the minimum and maximum allowed values."""
-        if kind in MEASUREMENT_FAULTS:
-            return MEASUREMENT_FAULTS[kind][1:]
-        if kind == "delay":
-            return 0.0, _DELAY_MAX
-        return (0.0, 1.0) if "PROBABILITY" in self.value else (-math.inf, math.inf)
+    bounds: tuple[float, float] = (-math.inf, math.inf)  # minimum and maximum value
 
 
 # The first matching group is used. Therefore, `silent=2` and `frozen=2` are servo faults, but
@@ -178,9 +141,9 @@ class _Form(NamedTuple):
 _ID = "=ID"
 _FORMS = (
     _Form(SERVO_FAULTS, _ID, (SERVOS,)),
-    _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True),
-    _Form([kind for kind in LINE_FAULTS if kind != "delay"], "=PROBABILITY", (SERVOS,)),
-    _Form(("delay",), "=SECONDS", (SERVOS,)),
+    _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True, bounds=(0.0, 1.0)),
+    _Form(LINE_FAULTS[:-1], "=PROBABILITY", (SERVOS,), bounds=(0.0, 1.0)),
+    _Form(("delay",), "=SECONDS", (SERVOS,), bounds=(0.0, _DELAY_MAX)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
     # `push` is a force along the faces, away from the palm [N]. `twist` is a torque [N·m].
     _Form(("push", "twist"), "=NUMBER", (OBJECT,)),
@@ -240,11 +203,14 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
     until = after if end is None else _number(end)
     if not after <= until < math.inf:
         raise refused(f"found the end time {end!r}, expected at least {start} s")
-    form = next((each for each in _FORMS if each.fits(side, kind, value is not None)), None)
-    if form is None:
+    for form in _FORMS:
+        has_value = form.value.startswith("[") or (value is not None) == bool(form.value)
+        if kind in form.kinds and has_value and (form.sided or side is None):
+            break
+    else:
         known = (f"{', '.join(each.kinds)} {each.value}".strip() for each in _FORMS)
         raise refused(f"expected one of {'; '.join(known)}")
-    if end is not None and (kind not in MEASUREMENT_FAULTS or kind in SWITCHED_FAULTS):
+    if end is not None and (kind not in MEASUREMENT_FAULTS or kind in _SWITCHED_FAULTS):
         raise refused(
             f"{kind} does not change gradually; give a single start time such as @{start}"
         )
@@ -252,7 +218,7 @@ def _parse(word: str, ids: tuple[int, ...]) -> list[FaultEvent]:
         raise refused("no servo has this ID")
     if value is None:
         value = BOARD_FAULTS.get(kind, 1.0)
-    low, high = form.bounds(kind)
+    low, high = MEASUREMENT_FAULTS[kind][1:] if kind in MEASUREMENT_FAULTS else form.bounds
     if not low <= value <= high:
         unit = form.value.strip("[=]").lower()
         raise refused(f"found {value:g}, expected {low:g} to {high:g} ({unit})")
@@ -291,7 +257,7 @@ class MeasurementFaults:
     def __call__(self, kind: str, t: float) -> float:
         """Return the value of a fault at time ``t`` [s]."""
         if kind not in self._changes:
-            return MEASUREMENT_FAULTS[kind].honest
+            return MEASUREMENT_FAULTS[kind][0]
         before, after, begin, over = self._changes[kind]
         if t < begin:
             return before

@@ -98,7 +98,7 @@ def test_faults_develop_linearly_over_their_duration_and_end():
     assert [faults("drift", t) for t in (6.999, 7.0)] == [0.0, 0.1]
     faults.clear()
     assert {kind: faults(kind, 9.0) for kind in MEASUREMENT_FAULTS} == {
-        kind: fault.honest for kind, fault in MEASUREMENT_FAULTS.items()
+        kind: neutral for kind, (neutral, *_) in MEASUREMENT_FAULTS.items()
     }
     with pytest.raises(KeyError):
         faults.begin("smell", 1.0, 0.0)

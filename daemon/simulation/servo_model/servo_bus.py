@@ -23,12 +23,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.control_table import by_name, crc16
 from softfinger.daemon.servos.joint import JointScale
-from softfinger.daemon.simulation.faults import (
-    LINE_FAULTS,
-    SERVO_FAULTS,
-    FaultSource,
-    LineFaults,
-)
+from softfinger.daemon.simulation.faults import LINE_FAULTS, SERVO_FAULTS, FaultSource
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import BROADCAST, Packet, PacketParser
 from softfinger.daemon.simulation.servo_model.servo import BusRecorder, EmulatedServo, prepared
@@ -155,8 +150,6 @@ class ServoBus:
             replies += self._answers(packet, listening, t)
             if not reads:
                 self.due = min([servo.next_event() for servo in self.servos])
-        if not self.faults.active:
-            return replies
         return [
             TimedReply(reply.delay, spoilt, late)
             for reply in replies
@@ -175,14 +168,14 @@ class ServoBus:
         """Start a fault; ``value`` is a probability for LINE_FAULTS and an ID for SERVO_FAULTS."""
         self.due = -math.inf
         if kind in LINE_FAULTS:
-            setattr(self.faults.rates, kind.replace("-", "_"), value)
+            self.faults.rates[kind] = value
         for servo in self.servos:
             if kind in SERVO_FAULTS and servo.id == value:
                 servo.fault(kind, t)
 
     def recover(self, t: float) -> None:
         """End all faults. Hardware errors stay latched until a reboot."""
-        self.faults.rates = LineFaults()
+        self.faults.rates = dict.fromkeys(LINE_FAULTS, 0.0)
         for servo in self.servos:
             for kind in ("answer", "recover"):
                 self.fault(kind, servo.id, t)
