@@ -105,7 +105,7 @@ _SWITCHED_FAULTS = ("mirror", "replay")  # faults that are either on or off
 
 
 class FaultError(SoftfingerError, ValueError):
-    """Invalid fault word. The error message states the reason."""
+    """Invalid fault or request. The error message states the reason."""
 
 
 class FaultEvent(NamedTuple):

@@ -86,7 +86,7 @@ def test_enabled_torque_a_stationary_finger_and_encoder_wrap_are_refused(
     try:
         assert calibrate(folder, *words) == 1
         assert "servo 2: torque is on" in capsys.readouterr().err
-        assert "torque of the left servo is on" in emulator.turn(["left=open"])
+        assert "torque of the left servo is on" in emulator.request("turn left=open")
     finally:
         servos.write(2, reg.TORQUE_ENABLE, 1, 0)
         servos.close()

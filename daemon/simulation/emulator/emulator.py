@@ -15,15 +15,16 @@ import math
 import os
 import selectors
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from softfinger.daemon.clock import Deadline
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.simulation.emulator.folder import ControlPort, LinkFolder, find_ports
-from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
+from softfinger.daemon.simulation.emulator.plate import Plate, parse_presses
 from softfinger.daemon.simulation.emulator.pty_bus import PtyServoBus
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard, encoder_for
 from softfinger.daemon.simulation.faults import (
@@ -71,6 +72,7 @@ class EmulatorClock:
     """
 
     pauses_when_late = False
+    wall = staticmethod(time.time)
 
     def __init__(self, deadline: Deadline) -> None:
         self.servos: PtyServoBus | None = None
@@ -99,10 +101,6 @@ class EmulatorClock:
                 self._origin += t - bound
                 t = bound
         return t
-
-    def wall(self) -> float:
-        """Return Unix time [s]."""
-        return time.time()
 
     def sleep_until(self, t: float) -> float:
         """Sleep until the hand's time is ``t``, and return the wake-up delay [s]."""
@@ -224,7 +222,7 @@ class Emulator:
         """
         ready = False
         while not self._stopping:
-            self._turn()
+            self._serve_once()
             if not ready and all(source.latest() is not None for source in self._sources.values()):
                 ready = True
                 on_ready()
@@ -247,7 +245,7 @@ class Emulator:
 
     # --- the event loop --------------------------------------------------------------------------
 
-    def _turn(self) -> None:
+    def _serve_once(self) -> None:
         """Wait for bytes or the next event, and then run one pass of the event loop."""
         servos, boards = self._servos, self._boards.values()
         due = min([self._advance_due, *[board.next_event() for board in boards]])
@@ -289,7 +287,7 @@ class Emulator:
     # --- requests and faults ---------------------------------------------------------------------
 
     def request(self, text: str) -> str:
-        """Handle a message from the control socket and return ``ok``, a report or an error.
+        """Handle a message from the control socket and return ``ok``, JSON or an error.
 
         Each word of the message is either a fault or a request. Fault times are relative to the
         current time. These requests exist:
@@ -297,26 +295,36 @@ class Emulator:
         - ``report``: reply with the result of :meth:`report` as JSON.
         - ``forget``: clear the bus record.
         - ``place``: reset the object's pose, velocity and load, and remove all plates.
-        - ``press …`` (first word): see :meth:`press`.
-        - ``turn …`` (first word): see :meth:`turn`.
+        - ``press PRESSES`` (first word): see `plate.parse_presses`.
+        - ``turn FINGER=POSE …`` (first word): turn joints as a person would. The poses are ``zero``
+          and the two joint stops, ``closed`` and ``open``. The emulator holds the joints in these
+          poses until a client writes to the servos.
 
-        If any word is invalid, all words are ignored and the reply is ``error: `` and the reason.
+        The reply to ``press`` and ``turn`` contains the time ``wait`` [s] until all plates or
+        joints have arrived. ``press`` and ``turn`` alone only request this time. If any word is
+        invalid, all words are ignored and the reply is ``error: `` and the reason.
         """
-        words = text.split()
-        if words[:1] == ["turn"]:
-            return self.turn(words[1:])
-        if words[:1] == ["press"]:
-            return self.press(text.partition("press")[2])
-        try:
-            faults = [word for word in words if word not in _REQUESTS]
-            # A client may have changed the IDs.
-            ids = self._ids
-            if self._servos is not None:
-                ids = tuple(servo.id for servo in self._servos.bus.servos)
-            fresh = parse_faults(faults, ids)
-        except FaultError as error:
-            return f"error: {error}"
+        kind, _, arguments = text.strip().partition(" ")
         now = self.clock.now()
+        try:
+            if kind == "turn":
+                reply = json.dumps({"wait": self._turn(arguments.split(), now)})
+            elif kind == "press":
+                reply = json.dumps({"wait": self._press(arguments.strip(), now)})
+            else:
+                reply = self._start(text.split(), now)
+        except SoftfingerError as error:
+            return f"error: {error}"
+        self._advance_due = now  # Faults without a start time begin immediately.
+        return reply
+
+    def _start(self, words: list[str], now: float) -> str:
+        """Start faults, and handle the requests that are single words."""
+        # A client may have changed the IDs.
+        ids = self._ids
+        if self._servos is not None:
+            ids = tuple(servo.id for servo in self._servos.bus.servos)
+        events = parse_faults([word for word in words if word not in _REQUESTS], ids)
         reply = json.dumps(self.report(now)) if "report" in words else "ok"
         if "forget" in words and self._servos is not None:
             self._servos.bus.forget(now)
@@ -324,61 +332,47 @@ class Emulator:
             self.hand.place_object()
             for finger in list(self._plates):
                 self._take_away(finger)
-        self._events += [event._replace(after=now + event.after) for event in fresh]
+        self._events += [event._replace(after=now + event.after) for event in events]
         self._events.sort(key=lambda event: event.after)
-        self._advance_due = now  # Faults without a start time begin immediately.
         return reply
 
-    def press(self, text: str) -> str:
-        """Start the presses in ``text`` and return the reply.
-
-        The reply is JSON, or ``error: `` and the reason. The JSON field ``wait`` is the time [s]
-        until all plates have reached their last presses. If the text is empty, no press is started.
-        """
-        now = self.clock.now()
-        if text.strip():
-            try:
-                presses = parse_presses(text, self.hand.table, self._simulation.modulus_scale)
-            except PlateError as error:
-                return f"error: {error}"
+    def _press(self, text: str, now: float) -> float:
+        """Start the presses in ``text``; return the time until the last plate arrives [s]."""
+        if text:
+            presses = parse_presses(text, self.hand.table, self._simulation.modulus_scale)
             if missing := presses.keys() - self._sources.keys():
-                return f"error: press: the scene has no sensor under the {missing.pop()} tip"
+                raise FaultError(f"press: the scene has no sensor under the {missing.pop()} tip")
             for finger, sequence in presses.items():
                 plate = self._plates.setdefault(finger, Plate())
                 plate.go(sequence, now)
                 self._sources[finger].stage = plate
-        ends = [plate.arrives - now for plate in self._plates.values()]
-        return json.dumps({"wait": max(0.0, *ends) if ends else 0.0})
+        return max([0.0, *(plate.arrives - now for plate in self._plates.values())])
 
     def _take_away(self, finger: str) -> None:
         """Remove the plate from a tip, so that the tip's sensor measures the object again."""
         del self._plates[finger]
         self._sources[finger].stage = None
 
-    def turn(self, words: Sequence[str]) -> str:
-        """Turn joints to the poses in ``words``, such as ``left=closed``, as a person would.
-
-        The poses are ``zero`` and the two joint stops, ``closed`` and ``open``. The emulator holds
-        the joints in these poses until a client writes to the servos. :meth:`press` describes the
-        format of the reply. If ``words`` is empty, no joint is turned.
-        """
-        now = self.clock.now()
+    def _turn(self, words: list[str], now: float) -> float:
+        """Turn the joints, and return the time until all joints have arrived [s]."""
         turns = [word.partition("=") for word in words]
         for finger, _, pose in turns:
             if finger not in FINGERS or pose not in _TURN_GOALS or self._servos is None:
-                return (
-                    "error: turn: expected left=POSE or right=POSE in a scene with servos; POSE is "
-                    f"one of {', '.join(_TURN_GOALS)}"
+                raise FaultError(
+                    "turn: expected left=POSE or right=POSE in a scene with servos; POSE is one of "
+                    f"{', '.join(_TURN_GOALS)}"
                 )
             if self._servos.bus.servos[FINGERS.index(finger)].torque_on:
-                return f"error: turn: torque of the {finger} servo is on; switch torque off first"
+                raise FaultError(
+                    f"turn: torque of the {finger} servo is on; switch torque off first"
+                )
         for finger, _, pose in turns:
             joint = FINGERS.index(finger)
             self.hand.drive(
                 joint, reg.CURRENT_BASED_POSITION_MODE, True, _TURN_GOALS[pose], _TURN_CURRENT
             )
             self._turned = now + _TURN_TIME
-        return json.dumps({"wait": max(0.0, self._turned - now)})
+        return max(0.0, self._turned - now)
 
     def _answer(self, text: str) -> str:
         """Handle a request, apply the faults that are already due, and return the reply."""
