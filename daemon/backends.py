@@ -54,7 +54,7 @@ def _built_in(place: str, metal: bool = True, hand: bool = False) -> Backend:
 
 _NONE = Backend(lambda: None, metal=False)
 _SHAPES = "simulation.physics.shapes"
-_SIMULATED_TACTILE = "simulation.sensor.simulated_tactile:SimulatedTactile"
+_SIMULATED_TACTILE = "simulation.simulated_tactile:SimulatedTactile"
 BUILT_IN: dict[Kind, dict[str, Backend]] = {
     "servos": {
         "simulated": _built_in("servos.simulated:SimulatedServos", metal=False, hand=True),

@@ -133,7 +133,7 @@ def _hand(scene: WantedScene) -> None:
 
 
 def _sensor(scene: WantedScene) -> None:
-    from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
+    from softfinger.daemon.simulation.simulated_tactile import make_sensor_model
 
     if not scene.sensing:
         return

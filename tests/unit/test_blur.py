@@ -8,7 +8,7 @@ import pytest
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
+from softfinger.daemon.simulation.simulated_tactile import make_sensor_model
 from softfinger.kinematics.estimation.estimator import ContactEstimator
 from softfinger.kinematics.sensing.blur import stencil
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid

@@ -13,8 +13,8 @@ from softfinger.daemon.simulation.faults import (
     parse_faults,
 )
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.simulation.simulated_tactile import SimulatedTactile
 from tests.harness.servos import BusClient
 
 SHAPE = (5, 7)

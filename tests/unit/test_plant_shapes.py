@@ -10,7 +10,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.profile.simulation_settings import SimulationSettings
 from softfinger.daemon.simulation.physics.shapes import shape_of
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
+from softfinger.daemon.simulation.simulated_tactile import SimulatedTactile
 from tests.harness.plant import (
     BOUNDED,
     PAPER,

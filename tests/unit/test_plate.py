@@ -6,7 +6,7 @@ import pytest
 
 from softfinger import ContactTable, Material
 from softfinger.daemon.simulation.emulator.plate import Plate, PlateError, parse_presses
-from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
+from softfinger.daemon.simulation.simulated_tactile import StageTouch
 from tests.harness.paper_tip import TIP
 
 TABLE = ContactTable.build(TIP, Material.constant(0.3e6))

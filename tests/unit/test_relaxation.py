@@ -12,7 +12,7 @@ from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
+from softfinger.daemon.simulation.simulated_tactile import make_sensor_model
 from softfinger.kinematics.calibration.calibration import CalibrationError, fit_relaxation, follow
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.tools.benchmarks.rigs import SOLID

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softfinger.daemon.simulation.sensor import sensor_model
-from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
+from softfinger.daemon.simulation import sensor_model
+from softfinger.daemon.simulation.sensor_model import SensorModel
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.paper_tip import LINEAR, MEASURED, PITCH, TIP, E, board, dense, flawed
 

@@ -11,7 +11,7 @@ from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.simulated_tactile import Arrivals, SimulatedTactile
+from softfinger.daemon.simulation.simulated_tactile import Arrivals, SimulatedTactile
 from softfinger.daemon.types import Goal, Reading
 from tests.harness.plant import PAPER
 from tests.harness.servos import RADIAN

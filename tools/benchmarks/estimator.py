@@ -28,7 +28,7 @@ from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS
-from softfinger.daemon.simulation.sensor.simulated_tactile import make_sensor_model
+from softfinger.daemon.simulation.simulated_tactile import make_sensor_model
 from softfinger.daemon.tactile.cobs import CobsDecoder
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material

@@ -36,8 +36,8 @@ from softfinger.daemon.simulation.faults import (
     parse_faults,
 )
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.simulated_tactile import SimulatedTactile
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
+from softfinger.daemon.simulation.simulated_tactile import SimulatedTactile
 from softfinger.daemon.types import FINGERS
 
 _STEP = 0.002  # maximum interval between physics updates [s]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.daemon.simulation.sensor.simulated_tactile import StageTouch
+from softfinger.daemon.simulation.simulated_tactile import StageTouch
 from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable

@@ -73,14 +73,12 @@ class SensorModel:
         self._sensitivity = sensitivity
         self._pressure = np.zeros(shape)
         self._count = count_for(self._cells, _FINENESS)
-        self._springs: SpringsPressure | None = None
-        self._solid: SolidPressure | None = None
+        self._tip: SolidPressure | SpringsPressure
         if tip.physics == "solid":
             blurred = replace(grid, blur=flaws.tactile_blur)
-            self._solid = SolidPressure(tip, material, blurred.images(tip))
+            self._tip = SolidPressure(tip, material, blurred.images(tip))
         else:
-            blur = flaws.tactile_blur
-            self._springs = SpringsPressure(self._cells, material, blur, self._count)
+            self._tip = SpringsPressure(self._cells, material, flaws.tactile_blur, self._count)
         self._plays = np.zeros((PLAY_COUNT if flaws.tactile_hysteresis > 0.0 else 0, *shape))
         self._creep_lag, self._response_lag = np.zeros((2, 2, *shape))
         self._offset = np.zeros(shape)  # counts
@@ -142,12 +140,12 @@ class SensorModel:
         flaws, pressure = self._flaws, self._pressure
         elapsed = 0.0 if self._t is None else max(t - self._t, 0.0)
         self._t = t
-        if self._solid is not None:
-            self._solid((d, n_x, n_y), fraction, pressure, self.grid.to_sensor(shear, 0.0))
+        if isinstance(self._tip, SolidPressure):
+            self._tip((d, n_x, n_y), fraction, pressure, self.grid.to_sensor(shear, 0.0))
         elif curvature > 0.0:
             pressure[:] = fraction * self._curved(d, n_x, n_y, 1.0 / curvature)
-        elif self._springs is not None:
-            self._springs((d, n_x, n_y), fraction, pressure)
+        else:
+            self._tip((d, n_x, n_y), fraction, pressure)
         if flaws.tactile_hysteresis > 0.0:
             hysteresis(pressure, flaws.tactile_hysteresis, self._plays)
         if flaws.tactile_creep > 0.0:
@@ -216,13 +214,10 @@ class SensorModel:
     ) -> None:
         """Apply the ``faults`` active at ``t`` [s], and write the cell counts to ``out``."""
         flaws, board = self._flaws, self._board
-        felt = self._pressure
-        if flaws.tactile_exponent != 1.0 or flaws.tactile_fold > 0.0:
-            full_scale = board.full_count * board.pascal_per_count
-            felt = curve(felt, flaws.tactile_exponent, full_scale, flaws.tactile_fold)
+        full_scale = board.full_count * board.pascal_per_count
+        felt = curve(self._pressure, flaws.tactile_exponent, full_scale, flaws.tactile_fold)
         signal = felt * self._sensitivity  # counts
-        if flaws.tactile_gain_drift > 0.0:
-            signal *= np.maximum(1.0 + self._warmer, 0.0)
+        signal *= np.maximum(1.0 + self._warmer, 0.0)
         if faults is not None:
             faults.apply(signal, board.full_count, t)
         rows, cols = np.zeros((self.grid.rows, 1)), np.zeros(self.grid.cols)

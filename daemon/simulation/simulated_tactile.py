@@ -16,7 +16,7 @@ from softfinger.daemon.profile.factory import make_grid, make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.simulation.faults import REPLAY_TIME_MAX
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
-from softfinger.daemon.simulation.sensor.sensor_model import SensorModel
+from softfinger.daemon.simulation.sensor_model import SensorModel
 from softfinger.daemon.types import Frame
 
 

@@ -1,1 +1,0 @@
-"""Simulate the readings, imperfections and frame delays of the pressure sensor."""
