@@ -156,19 +156,9 @@ _WORD = re.compile(r"(?:([^:]*):)?([a-z-]+)(?:=([^@]*))?(?:@(.*?)(?:\.\.(.*))?)?
 def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]:
     """Parse fault words and return the faults in chronological order.
 
-    - ``torn``, ``noisy``, ``silent``, ``frozen``, ``wrong-size``, ``saturated`` and ``zero`` affect
-      both boards. The prefix ``left:`` or ``right:`` selects one board; see :class:`TactileBoard`.
-    - ``drop=0.01``, ``silent=2`` etc. affect the servos; see :meth:`ServoBus.fault`.
-    - ``gain=0.5``, ``left:current=2`` etc. affect the measurements of one or both fingers; see
-      MEASUREMENT_FAULTS.
-    - ``unplug`` and ``plug`` affect the servo port, and ``left:unplug`` affects a board's port.
-    - ``push=15`` and ``twist=0.3`` apply a permanent load to the object. 0 removes the load.
-    - ``well`` ends all faults; ``left:well`` ends the faults of one finger's board and
-      measurements. ``well`` does not remove loads from the object.
-
-    The suffix ``@START`` sets the start time [s]. With ``@START..END``, a measurement fault
-    increases linearly from START to END. Faults with the same start time stay in the order of their
-    words.
+    `softfinger help emulate` lists the words. `TactileBoard` and MEASUREMENT_FAULTS define the
+    faults of boards and measurements. Without a prefix, these faults affect both fingers. Faults
+    with the same start time stay in the order of their words.
 
     Parameters
     ----------

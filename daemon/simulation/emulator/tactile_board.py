@@ -12,15 +12,15 @@ import math
 import os
 import termios
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softfinger.daemon.simulation.emulator.pty_bus import PtyPort
 from softfinger.daemon.simulation.faults import BOARD_FAULTS, WELL
+from softfinger.daemon.simulation.simulated_tactile import SimulatedTactile
 from softfinger.daemon.tactile import cobs
 from softfinger.daemon.tactile.glove import bits_of
 from softfinger.daemon.types import Frame
@@ -31,13 +31,6 @@ _TTY_SIZE_MAX = 2048
 _DRAIN = 4096
 _RETRY_TIME = 5e-4  # interval between checks for a late frame [s]
 _NOISE_LENGTH = 64  # maximum length of a noise burst between frames [bytes]
-
-
-class FrameSource(Protocol):
-    """Source of a board's frames, for example the simulated sensor."""
-
-    def latest(self) -> Frame | None:
-        """Return the newest frame that is due, or None before the first frame."""
 
 
 class FrameWriter(PtyPort):
@@ -97,7 +90,7 @@ class TactileBoard(FrameWriter):
 
     def __init__(
         self,
-        source: FrameSource,
+        source: SimulatedTactile,
         encoder: Encoder,
         rate: float,
         delay: float,
@@ -181,15 +174,11 @@ class TactileBoard(FrameWriter):
         return data
 
 
-# Arguments: counts [rows, cols], scan number and board time [s]. Result: bytes.
-Encode = Callable[[NDArray[np.uint16], int, float], bytes]
-
-
-@dataclass(frozen=True, slots=True)
-class Encoder:
+class Encoder(NamedTuple):
     """Encoder of a board's frames, and the byte that requests a frame, if any."""
 
-    encode: Encode
+    # Arguments: counts [rows, cols], scan number and board time [s].
+    encode: Callable[[NDArray[np.uint16], int, float], bytes]
     request: bytes = b""
 
 

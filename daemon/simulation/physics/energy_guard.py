@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.simulation.physics.plant_state import LAYERS, SHEARS, STOP_STIFFNESS, Plant
+from softfinger.daemon.simulation.physics.tip import average_layers
 from softfinger.kinematics.compiled.kernel import inner_kernel
 
 _LOSSLESS_TOLERANCE = 1e-3  # relative energy gain allowed in smooth steps of undamped tips
@@ -145,13 +146,9 @@ def shorten(plant: Plant, scale: float) -> None:
         bent = now.bristles[j] - before.bristles[j]
         now.bristles[j] = before.bristles[j] + scale * bent
         layers, earlier = plant.layers[j], plant.last_layers[j]
-        mean = square = 0.0
-        for k in range(LAYERS):  # Array expressions would load Numba's ufuncs at each startup.
-            layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
-            mean += layers[k] / LAYERS
         for k in range(LAYERS):
-            square += (layers[k] - mean) ** 2
-        plant.shear_variance[j] = square / LAYERS
+            layers[k] = earlier[k] + scale * (layers[k] - earlier[k])
+        average_layers(plant, j)
     for j in range(SHEARS):
         displacement = now.extra_shear[j] - before.extra_shear[j]
         now.extra_shear[j] = before.extra_shear[j] + scale * displacement

@@ -109,21 +109,6 @@ def free_object(plant: Plant, now: Motion) -> None:
 
 
 @inner_kernel
-def friction_level(plant: Plant, finger: int, rate: float, current: float) -> float:
-    """Return the friction torque [N·m] at which a joint slips.
-
-    The base, Stribeck and load terms are from Rhoban's model M4, which was identified for similar
-    servos (arXiv 2410.08650). The load term is proportional to the gear torque, |external − motor|.
-    """
-    p = plant.parameters
-    still = math.exp(-abs(rate) / p.joint_stribeck_speed)
-    gears = abs(plant.external[finger] - p.torque_constant * current)
-    share = p.joint_load_friction[0] + still * p.joint_load_friction[1]
-    friction: float = p.joint_friction + still * p.joint_stribeck + share * gears
-    return friction
-
-
-@inner_kernel
 def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> float:
     """Return the torque [N·m] of a joint's bristles, and store their damping as the joint's drag.
 
@@ -139,10 +124,17 @@ def bend_bristles(plant: Plant, finger: int, now: Motion, is_first: bool) -> flo
     and the energy of removed bristles is lost. A change in f therefore never adds energy. On
     average, new bristles are added halfway through the step. A stuck joint has half the critical
     damping. The sum of bristle torque and damping torque is limited to f.
+
+    The base, Stribeck and load terms of f are from Rhoban's model M4, which was identified for
+    similar servos (arXiv 2410.08650). The load term is proportional to the gear torque, |external −
+    motor|.
     """
     p, gears = plant.parameters, plant.gears[finger]
     rate = now.velocity[finger]
-    friction = friction_level(plant, finger, rate, now.current[finger])
+    still = math.exp(-abs(rate) / p.joint_stribeck_speed)
+    load = abs(plant.external[finger] - p.torque_constant * now.current[finger])
+    share = p.joint_load_friction[0] + still * p.joint_load_friction[1]
+    friction = p.joint_friction + still * p.joint_stribeck + share * load
     bent = now.bristles[finger]
     if friction > gears.level:
         bent -= (1.0 - gears.level / friction) * 0.5 * (gears.deflection + bent)

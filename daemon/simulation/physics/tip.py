@@ -305,6 +305,18 @@ def contact_forces(p: Parameters, table: Table, tip: TipContact, factor: float) 
 
 
 @inner_kernel
+def average_layers(plant: Plant, finger: int) -> float:
+    """Return the mean shear of a tip's layers [m], and store the variance."""
+    layers, mean, square = plant.layers[finger], 0.0, 0.0
+    for k in range(LAYERS):  # Array expressions would load Numba's ufuncs at each startup.
+        mean += layers[k] / LAYERS
+    for k in range(LAYERS):
+        square += (layers[k] - mean) ** 2
+    plant.shear_variance[finger] = square / LAYERS
+    return mean
+
+
+@inner_kernel
 def relax_shears(plant: Plant) -> None:
     """Relax the shears after a sub-step, based on the contacts at the start of the sub-step."""
     p, state = plant.parameters, plant.state
@@ -321,21 +333,13 @@ def relax_shears(plant: Plant) -> None:
         shear += p.creep * (neutral - shear)
         if p.tip_micro_slip:
             limit = 2.0 * p.tip_friction * max(tip.normal, 0.0) / stiffness
-            mean = 0.0
-            for k in range(LAYERS):
-                mean += layers[k] / LAYERS
-            brought = shear - mean
-            shear = 0.0
+            brought = shear - average_layers(plant, finger)
             for k in range(LAYERS):
                 layer_limit = limit * (k + 0.5) / LAYERS
                 layers[k] = neutral + min(
                     max(layers[k] + brought - neutral, -layer_limit), layer_limit
                 )
-                shear += layers[k] / LAYERS
-            square = 0.0
-            for k in range(LAYERS):
-                square += (layers[k] - shear) ** 2
-            plant.shear_variance[finger] = square / LAYERS
+            shear = average_layers(plant, finger)
         state.shear[finger] = shear
 
 

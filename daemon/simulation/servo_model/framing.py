@@ -115,9 +115,7 @@ class PacketParser:
         while True:
             start = buffer.find(_PREFIX)
             if start < 0:
-                # Keep bytes that may be the start of a header.
-                keep = next((n for n in (3, 2, 1) if buffer.endswith(_PREFIX[:n])), 0)
-                del buffer[: len(buffer) - keep]
+                del buffer[:-3]  # The last bytes may be the start of a header.
                 return None
             del buffer[:start]
             if len(buffer) < 7:

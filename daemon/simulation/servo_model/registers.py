@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.control_table import ServoModel
@@ -17,7 +16,6 @@ _PROFILE_MAX = 32_767
 _OFFSET_MAX = 1_044_479
 _MULTI_TURN = 1_048_575
 _STARTUP_FIRMWARE = 45
-_FORMATS = {1: "<B", 2: "<H", 4: "<I"}
 _GOALS = (reg.GOAL_PWM, reg.GOAL_CURRENT, reg.GOAL_VELOCITY, reg.GOAL_POSITION)
 _LIMITS = {
     reg.GOAL_PWM: reg.PWM_LIMIT,
@@ -31,103 +29,96 @@ _PAIRS = {  # maps lower limits to the corresponding upper limits
 _UPPER = {upper: lower for lower, upper in _PAIRS.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Item:
+class Item(NamedTuple):
     """One register.
 
     ``low`` and ``high`` are the limits stated in the manual. The values of other registers may
-    narrow this range.
+    narrow this range. Clients cannot write a register whose ``high`` is below ``low``.
     """
 
     address: int
     size: int
-    writable: bool = False
     default: int = 0
     low: int = 0
-    high: int = 0
-    signed: bool = False
+    high: int = -1
 
+    @property
+    def writable(self) -> bool:
+        return self.low <= self.high
 
-def _read_only(address: int, size: int, default: int = 0, signed: bool = False) -> Item:
-    return Item(address, size, default=default, signed=signed)
-
-
-def _setting(address: int, size: int, default: int, low: int, high: int) -> Item:
-    return Item(address, size, True, default, low, high, low < 0)
-
-
-def _gain(address: int, default: int) -> Item:
-    return _setting(address, 2, default, 0, _GAIN_MAX)
+    @property
+    def signed(self) -> bool:
+        return self.low < 0
 
 
 def _items_of(model: ServoModel, firmware: int) -> list[Item]:
     """Return all registers for a model and firmware, sorted by address."""
     low, high = model.voltage_min, model.voltage_max
     items = [
-        _read_only(reg.MODEL_NUMBER, 2, model.number),
-        _read_only(reg.MODEL_INFORMATION, 4),
-        _read_only(reg.FIRMWARE_VERSION, 1, firmware),
-        _setting(reg.ID, 1, 1, 0, framing.ID_MAX),
-        _setting(reg.BAUD_RATE, 1, 1, 0, model.highest_baud),
-        _setting(reg.RETURN_DELAY_TIME, 1, 250, 0, 254),
-        _setting(reg.DRIVE_MODE, 1, 0, 0, model.drive_mode_max),
-        _setting(reg.OPERATING_MODE, 1, reg.POSITION_MODE, 0, reg.CURRENT_BASED_POSITION_MODE),
-        _setting(reg.SHADOW_ID, 1, 255, 0, 255),
-        _setting(reg.PROTOCOL_TYPE, 1, 2, 2 if model.is_x330 else 1, 2),
-        _setting(reg.HOMING_OFFSET, 4, 0, -_OFFSET_MAX, _OFFSET_MAX),
-        _setting(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
-        _setting(reg.TEMPERATURE_LIMIT, 1, model.temperature_limit, 0, 100),
-        _setting(reg.MAX_VOLTAGE_LIMIT, 2, high, low, high),
-        _setting(reg.MIN_VOLTAGE_LIMIT, 2, low, low, high),
-        _setting(reg.PWM_LIMIT, 2, 885, 0, 885),
-        _setting(reg.VELOCITY_LIMIT, 4, model.velocity_limit, 0, model.velocity_max),
-        _setting(reg.MAX_POSITION_LIMIT, 4, 4095, 0, 4095),
-        _setting(reg.MIN_POSITION_LIMIT, 4, 0, 0, 4095),
-        _setting(reg.SHUTDOWN, 1, model.shutdown, 0, 63),
-        _setting(reg.TORQUE_ENABLE, 1, 0, 0, 1),
-        _setting(reg.LED, 1, 0, 0, 1),
-        _setting(reg.STATUS_RETURN_LEVEL, 1, 2, 0, 2),
-        _read_only(reg.REGISTERED_INSTRUCTION, 1),
-        _read_only(reg.HARDWARE_ERROR_STATUS, 1),
-        _gain(reg.VELOCITY_I_GAIN, model.velocity_gains[0]),
-        _gain(reg.VELOCITY_P_GAIN, model.velocity_gains[1]),
-        _gain(reg.POSITION_D_GAIN, model.position_gains[0]),
-        _gain(reg.POSITION_I_GAIN, model.position_gains[1]),
-        _gain(reg.POSITION_P_GAIN, model.position_gains[2]),
-        _gain(reg.FEEDFORWARD_2ND_GAIN, 0),
-        _gain(reg.FEEDFORWARD_1ST_GAIN, 0),
-        _setting(reg.BUS_WATCHDOG, 1, 0, 0, reg.WATCHDOG_MAX),
-        _setting(reg.GOAL_PWM, 2, 885, -885, 885),
-        _setting(reg.GOAL_VELOCITY, 4, 0, -model.velocity_max, model.velocity_max),
-        _setting(reg.PROFILE_ACCELERATION, 4, 0, 0, _PROFILE_MAX),
-        _setting(reg.PROFILE_VELOCITY, 4, 0, 0, _PROFILE_MAX),
-        _setting(reg.GOAL_POSITION, 4, 0, -_MULTI_TURN, _MULTI_TURN),
-        _read_only(reg.REALTIME_TICK, 2),
-        _read_only(reg.MOVING, 1),
-        _read_only(reg.MOVING_STATUS, 1),
-        _read_only(reg.PRESENT_PWM, 2, signed=True),
-        _read_only(reg.PRESENT_CURRENT, 2, signed=True),
-        _read_only(reg.PRESENT_VELOCITY, 4, signed=True),
-        _read_only(reg.PRESENT_POSITION, 4, signed=True),
-        _read_only(reg.VELOCITY_TRAJECTORY, 4, signed=True),
-        _read_only(reg.POSITION_TRAJECTORY, 4, signed=True),
-        _read_only(reg.PRESENT_INPUT_VOLTAGE, 2),
-        _read_only(reg.PRESENT_TEMPERATURE, 1),
+        Item(reg.MODEL_NUMBER, 2, model.number),
+        Item(reg.MODEL_INFORMATION, 4),
+        Item(reg.FIRMWARE_VERSION, 1, firmware),
+        Item(reg.ID, 1, 1, 0, framing.ID_MAX),
+        Item(reg.BAUD_RATE, 1, 1, 0, model.highest_baud),
+        Item(reg.RETURN_DELAY_TIME, 1, 250, 0, 254),
+        Item(reg.DRIVE_MODE, 1, 0, 0, model.drive_mode_max),
+        Item(reg.OPERATING_MODE, 1, reg.POSITION_MODE, 0, reg.CURRENT_BASED_POSITION_MODE),
+        Item(reg.SHADOW_ID, 1, 255, 0, 255),
+        Item(reg.PROTOCOL_TYPE, 1, 2, 2 if model.is_x330 else 1, 2),
+        Item(reg.HOMING_OFFSET, 4, 0, -_OFFSET_MAX, _OFFSET_MAX),
+        Item(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
+        Item(reg.TEMPERATURE_LIMIT, 1, model.temperature_limit, 0, 100),
+        Item(reg.MAX_VOLTAGE_LIMIT, 2, high, low, high),
+        Item(reg.MIN_VOLTAGE_LIMIT, 2, low, low, high),
+        Item(reg.PWM_LIMIT, 2, 885, 0, 885),
+        Item(reg.VELOCITY_LIMIT, 4, model.velocity_limit, 0, model.velocity_max),
+        Item(reg.MAX_POSITION_LIMIT, 4, 4095, 0, 4095),
+        Item(reg.MIN_POSITION_LIMIT, 4, 0, 0, 4095),
+        Item(reg.SHUTDOWN, 1, model.shutdown, 0, 63),
+        Item(reg.TORQUE_ENABLE, 1, 0, 0, 1),
+        Item(reg.LED, 1, 0, 0, 1),
+        Item(reg.STATUS_RETURN_LEVEL, 1, 2, 0, 2),
+        Item(reg.REGISTERED_INSTRUCTION, 1),
+        Item(reg.HARDWARE_ERROR_STATUS, 1),
+        Item(reg.VELOCITY_I_GAIN, 2, model.velocity_gains[0], 0, _GAIN_MAX),
+        Item(reg.VELOCITY_P_GAIN, 2, model.velocity_gains[1], 0, _GAIN_MAX),
+        Item(reg.POSITION_D_GAIN, 2, model.position_gains[0], 0, _GAIN_MAX),
+        Item(reg.POSITION_I_GAIN, 2, model.position_gains[1], 0, _GAIN_MAX),
+        Item(reg.POSITION_P_GAIN, 2, model.position_gains[2], 0, _GAIN_MAX),
+        Item(reg.FEEDFORWARD_2ND_GAIN, 2, 0, 0, _GAIN_MAX),
+        Item(reg.FEEDFORWARD_1ST_GAIN, 2, 0, 0, _GAIN_MAX),
+        Item(reg.BUS_WATCHDOG, 1, 0, 0, reg.WATCHDOG_MAX),
+        Item(reg.GOAL_PWM, 2, 885, -885, 885),
+        Item(reg.GOAL_VELOCITY, 4, 0, -model.velocity_max, model.velocity_max),
+        Item(reg.PROFILE_ACCELERATION, 4, 0, 0, _PROFILE_MAX),
+        Item(reg.PROFILE_VELOCITY, 4, 0, 0, _PROFILE_MAX),
+        Item(reg.GOAL_POSITION, 4, 0, -_MULTI_TURN, _MULTI_TURN),
+        Item(reg.REALTIME_TICK, 2),
+        Item(reg.MOVING, 1),
+        Item(reg.MOVING_STATUS, 1),
+        Item(reg.PRESENT_PWM, 2),
+        Item(reg.PRESENT_CURRENT, 2),
+        Item(reg.PRESENT_VELOCITY, 4),
+        Item(reg.PRESENT_POSITION, 4),
+        Item(reg.VELOCITY_TRAJECTORY, 4),
+        Item(reg.POSITION_TRAJECTORY, 4),
+        Item(reg.PRESENT_INPUT_VOLTAGE, 2),
+        Item(reg.PRESENT_TEMPERATURE, 1),
     ]
     if model.senses_current:
         limit = model.current_limit
-        items.append(_setting(reg.CURRENT_LIMIT, 2, limit, 0, limit))
-        items.append(_setting(reg.GOAL_CURRENT, 2, limit, -limit, limit))
+        items.append(Item(reg.CURRENT_LIMIT, 2, limit, 0, limit))
+        items.append(Item(reg.GOAL_CURRENT, 2, limit, -limit, limit))
     if model.pwm_slope is not None:
-        items.append(_setting(reg.PWM_SLOPE, 1, model.pwm_slope, 1, 255))
+        items.append(Item(reg.PWM_SLOPE, 1, model.pwm_slope, 1, 255))
     if firmware >= _STARTUP_FIRMWARE:
-        items.append(_setting(reg.STARTUP_CONFIGURATION, 1, 0, 0, 3))
-        items.append(_read_only(reg.BACKUP_READY, 1))
+        items.append(Item(reg.STARTUP_CONFIGURATION, 1, 0, 0, 3))
+        items.append(Item(reg.BACKUP_READY, 1))
     highest = model.highest_address(firmware)
     for address, data, entries in model.indirect_blocks(firmware):
         for i in range(entries):
-            items.append(_setting(address + 2 * i, 2, data + i, reg.RAM, highest))
-            items.append(_setting(data + i, 1, 0, 0, 255))
+            items.append(Item(address + 2 * i, 2, data + i, reg.RAM, highest))
+            items.append(Item(data + i, 1, 0, 0, 255))
     return sorted(items, key=lambda item: item.address)
 
 
@@ -142,11 +133,6 @@ class ControlTable:
         self.size = model.highest_address(firmware) + 1
         self.memory = bytearray(self.size)
         self._modes = model.modes
-        self._unpack = {}
-        for item in self.at.values():
-            form = _FORMATS[item.size]
-            layout = struct.Struct(form.lower() if item.signed else form)
-            self._unpack[item.address] = layout.unpack_from
         self._indirect = {
             data + i: address + 2 * i
             for address, data, entries in model.indirect_blocks(firmware)
@@ -158,8 +144,9 @@ class ControlTable:
 
     def get(self, address: int) -> int:
         """Return the value of the register at ``address``."""
-        value: int = self._unpack[address](self.memory, address)[0]
-        return value
+        item = self.at[address]
+        data = self.memory[address : address + item.size]
+        return int.from_bytes(data, "little", signed=item.signed)
 
     def set(self, address: int, value: int) -> None:
         """Store a value regardless of access rights; bits that do not fit are dropped."""
@@ -213,7 +200,8 @@ class ControlTable:
                 return framing.ACCESS, []
             if places[i : i + item.size] != list(range(places[i], places[i] + item.size)):
                 return framing.DATA_LENGTH, []
-            plan.append((item, self._unpack[item.address](data, i)[0]))
+            value = int.from_bytes(data[i : i + item.size], "little", signed=item.signed)
+            plan.append((item, value))
             i += item.size
         if not all(item.low <= value <= item.high for item, value in plan):
             return framing.DATA_RANGE, plan
