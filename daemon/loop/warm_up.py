@@ -196,7 +196,7 @@ def _many(scene: WantedScene) -> None:
 
 _TABLE = Part("contact table", 27, _table)
 _ESTIMATOR = Part("estimator", 79, _estimator)
-_HAND = Part("simulated hand", 64, _hand, after=_TABLE.name)
+_HAND = Part("simulated hand", 58, _hand, after=_TABLE.name)
 _SENSOR = Part("simulated sensor", 14, _sensor)
 _FILTER = Part("contact filter", 25, _filter, after=_TABLE.name)
 _GRIP = Part("grip", 26, _grip)

@@ -158,19 +158,8 @@ def parse_faults(words: Iterable[str], ids: tuple[int, ...]) -> list[FaultEvent]
 
     `softfinger help emulate` lists the words. `TactileBoard` and MEASUREMENT_FAULTS define the
     faults of boards and measurements. Without a prefix, these faults affect both fingers. Faults
-    with the same start time stay in the order of their words.
-
-    Parameters
-    ----------
-    words
-        Fault words.
-    ids
-        Servo IDs.
-
-    Raises
-    ------
-    FaultError
-        If a word is invalid.
+    with the same start time stay in the order of their words. ``ids`` are the servo IDs. Raises
+    FaultError if a word is invalid.
     """
     events = (event for word in words for event in _parse(word.strip(), ids))
     return sorted(events, key=attrgetter("after"))

@@ -132,16 +132,11 @@ class Emulator:
 
         Parameters
         ----------
-        settings, folder
-            Hand settings, and folder for the links.
-        baud
-            Baud rate of the servos, or 0 for servos that reply immediately at any baud rate.
-        factory
-            True for servos with factory defaults, except for IDs and baud rate.
-        ids
-            Servo IDs that replace the configured IDs. Duplicates are allowed.
-        faults
-            Faults; see :func:`parse_faults`.
+        settings, folder, faults
+            Hand settings, folder for the links, and faults (see :func:`parse_faults`).
+        baud, factory, ids
+            See :meth:`ServoBus.from_settings`. If ``baud`` is 0, servos reply immediately at any
+            baud rate.
         tell
             Function that receives a log line when a fault begins or a plate reaches its position.
 

@@ -80,19 +80,9 @@ class PtyServoBus(PtyPort):
     """Servo bus on a new pseudo-terminal.
 
     The caller must call :meth:`service` when :meth:`fileno` is readable, and at the time that
-    :meth:`next_event` returns.
-
-    Parameters
-    ----------
-    bus
-        Emulated servos.
-    baud
-        If 0, servos reply immediately at any rate. Otherwise, servos ignore clients that use
-        another rate, and replies are delayed by their transmission time.
-    clock
-        Clock for all times.
-    spin
-        Duration [s] of busy waiting before a paced reply is due, because sleeps end late.
+    :meth:`next_event` returns. If ``baud`` is 0, servos reply immediately at any rate. Otherwise,
+    servos ignore clients that use another rate, and replies are delayed by their transmission time.
+    Because sleeps end late, the last ``spin`` [s] before a reply are a busy wait.
     """
 
     def __init__(

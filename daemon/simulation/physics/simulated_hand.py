@@ -170,23 +170,10 @@ class SimulatedHand:
         table: ContactTable | None = None,
         step: float | None = None,
     ) -> None:
-        """Create the hand at standstill with torque off.
+        """Create the hand at standstill at the time ``start`` [s], with torque off.
 
-        Parameters
-        ----------
-        settings
-            Settings of hand and simulation.
-        start
-            Start time [s].
-        table
-            Contact table for the tip and material; None to compute it.
-        step
-            Sub-step [s]; None to choose it from the stiffness.
-
-        Raises
-        ------
-        SettingsError
-            If the settings can't be simulated.
+        If ``table`` is None, the contact table is computed. If ``step`` [s] is None, the sub-step
+        is derived from the stiffness. Raises SettingsError if the settings can't be simulated.
         """
         if table is None:
             table = make_table(settings)
@@ -226,7 +213,7 @@ class SimulatedHand:
         self.shear = state.shear  # d_t [m]
         self.on_other_tip = self.plant.on_other_tip  # 1 if the contact is with the other tip
         self.torque_on = goals.torque_on  # 1 if the servo's torque is on
-        self._mode, self._goal_q, self._goal_current = goals.mode, goals.q, goals.current
+        self._goals = goals
         # Measurement faults of the left and the right finger. These faults do not change the
         # physics.
         self.measurement_faults = MeasurementFaults(), MeasurementFaults()
@@ -272,14 +259,13 @@ class SimulatedHand:
 
         The Dynamixel mode numbers are 0 (current), 3 (position) and 5 (current-based position).
         """
-        self._mode[joint] = mode
-        self.torque_on[joint] = torque_on
-        self._goal_q[joint] = goal_q
-        self._goal_current[joint] = goal_current
+        goals = self._goals
+        goals.mode[joint], goals.torque_on[joint] = mode, torque_on
+        goals.q[joint], goals.current[joint] = goal_q, goal_current
 
     def tune(self, joint: int, stiffness: float, damping: float, duty: float) -> None:
         """Set a servo's position gains and its voltage limit, a fraction of the supply voltage."""
-        goals = self.plant.goals
+        goals = self._goals
         goals.stiffness[joint], goals.damping[joint] = stiffness, damping
         goals.duty[joint] = duty
 
