@@ -95,7 +95,7 @@ class SimulatedTactile:
     def open(self) -> None:
         """Wait for the first frame to arrive."""
         self._open = True
-        self._clock.sleep_until(self._arrivals.next_arrival)
+        self._clock.sleep_until(self.next_arrival)
         self.latest()
 
     def latest(self) -> Frame | None:
@@ -105,6 +105,11 @@ class SimulatedTactile:
             self._hand.advance(now)
             self._read(self._arrivals.number, self._arrivals.arrival)
         return self._frame
+
+    @property
+    def next_arrival(self) -> float:
+        """Arrival time of the next frame [s]."""
+        return self._arrivals.next_arrival
 
     def counters(self) -> dict[str, int]:
         """Return the numbers of ``frames`` received and ``missed`` since `open` was called.

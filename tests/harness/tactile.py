@@ -82,7 +82,7 @@ class Rig:
         hand = None
         if backend in SERIAL:
             self.images = source or _Images()
-            self.board = TactileBoard(self.images, ENCODERS[backend], RATE, 0.0)
+            self.board = TactileBoard(self.images, ENCODERS[backend])
             self._faults = parse_faults([f"right:{fault}"] if fault else [], ())
             self._stack.callback(self.board.unplug)
             tactile["port"] = ("/dev/none", self.board.path)
@@ -135,4 +135,4 @@ class Rig:
             while self._faults and self._faults[0].after < t:
                 begun = self._faults.pop(0)
                 self.board.faults[begun.kind] = begun.value
-            self.board.service(t)
+            self.board.service()

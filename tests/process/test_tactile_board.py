@@ -58,8 +58,8 @@ class Client:
         return got
 
 
-def board(source: Source, rate: float = 100.0, delay: float = 0.01) -> TactileBoard:
-    return TactileBoard(source, ENCODERS["flexitac"], rate, delay, seed=4)
+def board(source: Source) -> TactileBoard:
+    return TactileBoard(source, ENCODERS["flexitac"], seed=4)
 
 
 def test_each_frame_is_sent_once_and_decoded():
@@ -67,35 +67,17 @@ def test_each_frame_is_sent_once_and_decoded():
     made = board(source)
     client = Client(made.path)
     decoder = FlexiTacDecoder(ROWS, COLS)
-    made.service(0.0)
+    made.service()
     assert made.sent == 0
     for k in range(5):
         source.make(k + 1)
-        made.service(0.01 * k)
-        made.service(0.01 * k)
+        made.service()
+        made.service()
         decoder.feed(client.expect(SIZE), 0.0)
     decoded = decoder.settle()
     assert np.array_equal(decoded.data, np.full((ROWS, COLS), 5))
     assert decoder.counters()["frames"] == made.sent == 5
     os.close(client.fd)
-    made.unplug()
-
-
-def test_the_next_event_is_the_next_frame_delivery():
-    source = Source()
-    made = board(source, rate=100.0, delay=0.004)
-    assert made.next_event() == -np.inf
-    # Due to rounding, an event may occur just before its frame is due. The board must not repeat an
-    # early event immediately.
-    times = (0.0, 0.004, np.nextafter(0.014, 0.0), 0.0561)
-    for seq, (t, due) in enumerate(zip(times, (0.004, 0.014, 0.024, 0.064), strict=True)):
-        source.make(seq)
-        made.service(t)
-        assert made.next_event() == pytest.approx(due)
-    made.service(0.0562)  # The frame is late, so check for it soon.
-    assert made.next_event() == pytest.approx(0.0567)
-    made.service(0.0638)
-    assert made.next_event() == pytest.approx(0.064)
     made.unplug()
 
 
@@ -139,7 +121,7 @@ def test_bytes_on_the_line_during_faults(kind):
     made.faults[kind] = 1.0
     for k in range(40):
         source.make(k)
-        made.service(k / 100 + 0.01)
+        made.service()
         data = client.read()
         if kind == "noisy":
             assert len(data) > SIZE

@@ -158,7 +158,6 @@ class Emulator:
         self._selector.register(self._wake[0], selectors.EVENT_READ)
         self._servos: PtyServoBus | None = None
         self._boards: dict[str, TactileBoard] = {}
-        self._sources: dict[str, SimulatedTactile] = {}
         self._plates: dict[str, Plate] = {}
         self._turned = 0.0  # time at which the last manual joint rotation ends
         self._tell = tell
@@ -196,31 +195,22 @@ class Emulator:
     def _add_board(self, settings: Settings, finger: int) -> None:
         source = SimulatedTactile(settings, self.hand, self.clock, finger)
         source.open()
-        tactile, simulation = settings.tactile, settings.simulation
+        tactile = settings.tactile
         board = TactileBoard(
             source,
             encoder_for(tactile.backend, tactile.full_count),
-            tactile.rate,
-            simulation.tactile_delay,
-            seed=simulation.seed + finger,
+            seed=settings.simulation.seed + finger,
         )
-        self._sources[FINGERS[finger]] = source
         self._boards[FINGERS[finger]] = board
         self._selector.register(board, selectors.EVENT_READ, board.hear)
         self._closing.callback(board.unplug)
         self._links.link(f"tactile-{FINGERS[finger]}", board.path)
 
     def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Serve the ports until :meth:`end` is called.
-
-        Call ``on_ready`` once, when every sensor has produced a frame.
-        """
-        ready = False
+        """Call ``on_ready``, and serve the ports until :meth:`end` is called."""
+        on_ready()
         while not self._stopping:
             self._serve_once()
-            if not ready and all(source.latest() is not None for source in self._sources.values()):
-                ready = True
-                on_ready()
 
     @property
     def ports(self) -> dict[str, Path]:
@@ -261,7 +251,7 @@ class Emulator:
         late = [board for board in boards if board.next_event() <= t]
         if late:
             self._advance(t)
-            late[0].service(t)
+            late[0].service()
         elif self._advance_due <= t:
             self._advance(t)
 
@@ -335,18 +325,18 @@ class Emulator:
         """Start the presses in ``text``; return the time until the last plate arrives [s]."""
         if text:
             presses = parse_presses(text, self.hand.table, self._simulation.modulus_scale)
-            if missing := presses.keys() - self._sources.keys():
+            if missing := presses.keys() - self._boards.keys():
                 raise FaultError(f"press: the scene has no sensor under the {missing.pop()} tip")
             for finger, sequence in presses.items():
                 plate = self._plates.setdefault(finger, Plate())
                 plate.go(sequence, now)
-                self._sources[finger].stage = plate
+                self._boards[finger].source.stage = plate
         return max([0.0, *(plate.arrives - now for plate in self._plates.values())])
 
     def _take_away(self, finger: str) -> None:
         """Remove the plate from a tip, so that the tip's sensor measures the object again."""
         del self._plates[finger]
-        self._sources[finger].stage = None
+        self._boards[finger].source.stage = None
 
     def _turn(self, words: list[str], now: float) -> float:
         """Turn the joints, and return the time until all joints have arrived [s]."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import array
 import contextlib
 import fcntl
-import math
 import os
 import termios
 from collections.abc import Callable
@@ -29,7 +28,6 @@ from softfinger.daemon.types import Frame
 # lower.
 _TTY_SIZE_MAX = 2048
 _DRAIN = 4096
-_RETRY_TIME = 5e-4  # interval between checks for a late frame [s]
 _NOISE_LENGTH = 64  # maximum length of a noise burst between frames [bytes]
 
 
@@ -92,22 +90,17 @@ class TactileBoard(FrameWriter):
         self,
         source: SimulatedTactile,
         encoder: Encoder,
-        rate: float,
-        delay: float,
         seed: int = 1,
     ) -> None:
-        """Create a board; frame k is due at k/rate + delay [s]. ``seed`` determines the faults."""
+        """Create a board that sends the frames of ``source``. ``seed`` determines the faults."""
         super().__init__()
-        self._source = source
+        self.source = source
         self._encoder = encoder
         self._requested = not encoder.request
-        self._rate = rate
-        self._delay = delay
         self.faults: dict[str, float] = {}
         self._random = np.random.default_rng(seed)
-        self._seq = -1
+        self._seq = -1  # number of the last frame
         self._frozen: NDArray[np.uint16] | None = None  # image that a frozen board repeats
-        self._due = -math.inf
         self.sent = 0  # frames
 
     def apply_fault(self, kind: str, value: float, t: float) -> None:
@@ -127,18 +120,14 @@ class TactileBoard(FrameWriter):
 
     def next_event(self) -> float:
         """Return the time [s] at which :meth:`service` must be called next."""
-        return self._due
+        return self.source.next_arrival
 
-    def service(self, t: float) -> None:
-        """Send the newest frame if a new frame is due at time t [s]."""
+    def service(self) -> None:
+        """Send the newest frame if it has not been sent yet."""
         if self.plugged:
             self.flush()
-        # Adding 1e-6 prevents rounding errors from making the same frame due twice.
-        self._due = (math.floor((t - self._delay) * self._rate + 1e-6) + 1) / self._rate
-        self._due += self._delay
-        frame = self._source.latest()
+        frame = self.source.latest()
         if frame is None or frame.seq == self._seq:
-            self._due = min(self._due, t + _RETRY_TIME)
             return
         self._seq = frame.seq
         if not self._requested or not self.plugged:
