@@ -27,15 +27,18 @@ ALL = "all"
 LATE_REPLY_DELAY = 0.010  # s
 
 
-LINE_FAULTS = (
-    "lose",  # probability that an instruction is lost
-    "lose-writes",  # additional probability of losing an instruction that is not a read
+_REPLY_FAULTS = (
     "drop",  # probability that a reply is lost
     "late",  # probability that a reply is delayed by LATE_REPLY_DELAY
     "truncate",  # probability that the end of a reply is missing
     "corrupt",  # probability that one bit of a reply is flipped
     "duplicate",  # probability that a reply is sent twice
     "delay",  # delay of all replies, as with a slow adapter [s]
+)
+LINE_FAULTS = (
+    "lose",  # probability that an instruction is lost
+    "lose-writes",  # additional probability of losing an instruction that is not a read
+    *_REPLY_FAULTS,
 )
 _DELAY_MAX = 1.0  # s
 _SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
@@ -65,14 +68,14 @@ class FaultSource:
 
     def loses(self, reads: bool) -> bool:
         """Return True if the next instruction is lost; ``reads`` is True for a read instruction."""
-        kinds = LINE_FAULTS[:1] if reads else LINE_FAULTS[:2]
-        rates = [self.rates[kind] for kind in kinds if self.rates[kind]]
-        return any(self._random.random() < rate for rate in rates)
+        kinds = ("lose",) if reads else ("lose", "lose-writes")
+        rates = [self.rates[kind] for kind in kinds]
+        return any(rate > 0.0 and self._random.random() < rate for rate in rates)
 
     def spoil(self, reply: bytes) -> list[tuple[float, bytes]]:
         """Apply faults to a reply and return the bytes to send, each with its extra delay [s]."""
         rates, chance = self.rates, self._random.random
-        if not any(rates[kind] for kind in LINE_FAULTS[2:]):
+        if not any(rates[kind] for kind in _REPLY_FAULTS):
             return [(0.0, reply)]
         if chance() < rates["drop"]:
             return []
@@ -142,7 +145,7 @@ _ID = "=ID"
 _FORMS = (
     _Form(SERVO_FAULTS, _ID, (SERVOS,)),
     _Form(BOARD_FAULTS, "[=PROBABILITY]", FINGERS, sided=True, bounds=(0.0, 1.0)),
-    _Form(LINE_FAULTS[:-1], "=PROBABILITY", (SERVOS,), bounds=(0.0, 1.0)),
+    _Form(LINE_FAULTS[:-1], "=PROBABILITY", (SERVOS,), bounds=(0.0, 1.0)),  # without `delay`
     _Form(("delay",), "=SECONDS", (SERVOS,), bounds=(0.0, _DELAY_MAX)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
     # `push` is a force along the faces, away from the palm [N]. `twist` is a torque [N·m].

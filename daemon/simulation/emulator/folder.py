@@ -82,12 +82,10 @@ class LinkFolder:
             os.close(lock)
 
     def link(self, name: str, target: str) -> None:
-        """Create or replace the link ``name`` to ``target`` atomically."""
+        """Create or replace the link ``name`` to ``target``."""
         link = self.path / name
-        fresh = self.path / f".{name}.{os.getpid()}"
-        fresh.unlink(missing_ok=True)
-        fresh.symlink_to(target)
-        fresh.replace(link)
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
         self._targets[name] = target
 
     def unlink(self, name: str) -> None:
