@@ -376,6 +376,7 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
         set_motor_slopes(plant, g)
         factorise(plant, g)
         begin_stage(plant, state, plant.stages[0], plant.no_motion, plant.first, g)
+        # A different order of the two sums in either stage would change the last bits of results.
         take_extra_stiffness(plant, plant.first, g)
         take_stiffness(plant, plant.first, g)
         finish_stage(plant, plant.first, g)
