@@ -228,12 +228,11 @@ def _export(
 ) -> FrameRecording:
     export = tekscan.parse(tekscan.decode(read_file(path)), 1.0 / rate)
     scale = 1.0 if export.raw else scale
-    found = _checked({"frames": export.values, "live": export.live}, scale, rate, noise, notes)
+    found = _checked({"frames": export.values}, scale, rate, noise, notes)
     full_count = None
     if math.isfinite(export.full):
         full_count = max(min(int(export.full / scale), _COUNT_MAX), 1)
-    pitch = None if math.isnan(sum(export.pitch)) else export.pitch
-    return replace(found, t=export.t, pitch=pitch, full_count=full_count, whole=export.raw)
+    return replace(found, t=export.t, pitch=export.pitch, full_count=full_count, whole=export.raw)
 
 
 def _checked(

@@ -27,7 +27,7 @@ from softfinger.daemon.errors import SoftfingerError
 
 _SIZE_MAX = 1024  # maximum number of rows or columns
 _HEADER_LINES_MAX = 1000
-_READING_MAX = 1e12  # maximum reading, in the unit of the file
+_NUMBER_MAX = 1e12
 _RAW_SATURATION = 255  # maximum reading of the manufacturer's 8-bit electronics
 _SATURATION_FRACTION = 0.995  # fraction of the saturation pressure above which a cell is saturated
 _EDGE_CHARACTERS = ' \t,;"'  # characters that spreadsheets add at line ends
@@ -72,16 +72,15 @@ class Export:
     """Parsed export.
 
     ``values`` float64 [frames, rows, cols] are in counts if ``raw`` is True, and otherwise in Pa.
-    The values are 0 where ``live`` [rows, cols] is False. ``t`` float64 [frames] is the time since
-    the first frame [s]. ``pitch`` (x, y) [m] is NaN if the header does not contain it. ``full`` is
-    the reading of a saturated cell, or inf if unknown.
+    Positions without a cell are NaN. ``t`` float64 [frames] is the time since the first frame [s].
+    ``pitch`` (x, y) [m] is None if the header does not contain it. ``full`` is the reading of a
+    saturated cell, or inf if unknown.
     """
 
     values: NDArray[np.float64]
-    live: NDArray[np.bool_]
     t: NDArray[np.float64]
     raw: bool
-    pitch: tuple[float, float]
+    pitch: tuple[float, float] | None
     full: float
 
 
@@ -105,22 +104,13 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     """
     lines = text.splitlines()
     header, first = _header(lines)
-    rows, cols = _count(header, "ROWS"), _count(header, "COLS")
-    numbers, frames, places = _frames(lines, first, rows, cols)
-    values, live = _live_cells(np.array(frames), places)
+    numbers, values = _frames(lines, first, _count(header, "ROWS"), _count(header, "COLS"))
     pitch = _pitch(header)
     factor = _unit(header, pitch)
-    raw = factor == 0.0
-    wrong = np.argwhere((np.abs(values) > _READING_MAX) | (raw & (values < 0.0)))
-    if wrong.size:
-        k, i, j = wrong[0].tolist()
-        low = 0.0 if raw else -_READING_MAX
-        raise TekscanError(
-            f"frame {numbers[k]}: row {i + 1}, cell {j + 1} is {values[k, i, j]}, expected {low:g} "
-            f"to {_READING_MAX:g}"
-        )
-    full = _RAW_SATURATION if raw and values.max() <= _RAW_SATURATION else math.inf
-    if not raw:
+    full = math.inf
+    if factor is None:
+        full = _RAW_SATURATION if np.nanmax(values, initial=0.0) <= _RAW_SATURATION else math.inf
+    else:
         rounding = 0.5 * factor * 10.0 ** -_digits(values)
         values *= factor
         if "SATURATION_PRESSURE" in header:
@@ -132,31 +122,14 @@ def parse(text: str, seconds_per_frame: float = 0.01) -> Export:
     if not step > 0.0:
         raise TekscanError("SECONDS_PER_FRAME: expected a positive number of seconds")
     t = (np.array(numbers, np.float64) - numbers[0]) * step
-    return Export(values, live, t, raw, pitch, full if full > 0.0 else math.inf)
-
-
-def _live_cells(
-    values: NDArray[np.float64], places: list[list[int]]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Set cells without numbers to 0; return the values and a mask of the cells with numbers.
-
-    Raises TekscanError if a cell contains a number only in some frames.
-    """
-    unknown = np.isnan(values)
-    live: NDArray[np.bool_] = ~np.any([np.isneginf(values).any(0), unknown.all(0)], axis=0)
-    wrong = np.argwhere(unknown & live)
-    if wrong.size:
-        k, i, _ = wrong[0].tolist()
-        raise TekscanError(f"line {places[k][i]}: found a cell that is not a number")
-    if not live.any():
-        raise TekscanError("the file does not contain any cells")
-    return np.where(live, values, 0.0), live
+    return Export(values, t, factor is None, pitch, full if full > 0.0 else math.inf)
 
 
 def _digits(values: NDArray[np.float64]) -> int:
     """Return the number of decimal places in the readings."""
     for digits in range(9):
-        if np.allclose(values, np.round(values, digits), rtol=1e-12, atol=0.0):
+        rounded = np.round(values, digits)
+        if np.allclose(values, rounded, rtol=1e-12, atol=0.0, equal_nan=True):
             return digits
     return 9
 
@@ -184,11 +157,10 @@ def _header(lines: list[str]) -> tuple[dict[str, str], int]:
 
 def _frames(
     lines: list[str], first: int, rows: int, cols: int
-) -> tuple[list[int], list[list[NDArray[np.float64]]], list[list[int]]]:
-    """Parse the lines after the header; return frame numbers, rows, and the rows' line numbers."""
+) -> tuple[list[int], NDArray[np.float64]]:
+    """Parse the lines after the header; return frame numbers and readings [frames, rows, cols]."""
     numbers: list[int] = []
-    frames: list[list[NDArray[np.float64]]] = []
-    places: list[list[int]] = []
+    readings: list[list[float]] = []
     separator = ""
     for number, text in enumerate(lines[first:], first + 1):
         line = text.strip()
@@ -196,38 +168,31 @@ def _frames(
             continue
         if line.lstrip(_EDGE_CHARACTERS).startswith("@@"):
             break
-        if re.match(r'"?[^\W\d]{2}', line):  # A row starts with a number or with a single letter B.
-            match = re.match(r'"?[^\W\d]+[\s:#,;]*(\d{1,9})\b', line)
-            if match is None:
-                if re.match(r'"?(nan|inf)', line, re.IGNORECASE) is None:
-                    raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
-            else:
-                if frames and len(frames[-1]) < rows:
-                    had = f"frame {numbers[-1]} has {len(frames[-1])} of {rows} rows"
-                    raise TekscanError(f"line {number}: {had}")
-                if numbers and int(match[1]) <= numbers[-1]:
-                    what = f"frame {match[1]} after frame {numbers[-1]}"
-                    raise TekscanError(f"line {number}: found {what}, expected increasing numbers")
-                numbers.append(int(match[1]))
-                frames.append([])
-                places.append([])
-                continue
-        if not frames:  # single-frame export
+        missing = len(numbers) * rows - len(readings)  # rows that the last frame still needs
+        # A row starts with a number, with NaN, or with a single letter B.
+        match = re.match(r'"?(?!nan|inf)[^\W\d]{2,}[\s:#,;]*(\d{1,9})\b', line, re.IGNORECASE)
+        if match is not None:
+            frame = int(match[1])
+            if missing:
+                had = f"frame {numbers[-1]} has {rows - missing} of {rows} rows"
+                raise TekscanError(f"line {number}: {had}")
+            if numbers and frame <= numbers[-1]:
+                what = f"frame {frame} after frame {numbers[-1]}"
+                raise TekscanError(f"line {number}: found {what}, expected increasing numbers")
+            numbers.append(frame)
+            continue
+        if not numbers:  # single-frame export
             numbers.append(1)
-            frames.append([])
-            places.append([])
-        if len(frames[-1]) == rows:
+        elif not missing:
             raise TekscanError(f"line {number}: found {line[:40]!r}, expected Frame n")
         separator = separator or _separator(line, cols)
-        frames[-1].append(_row(line, separator, cols, number))
-        places[-1].append(number)
-    if not frames:
+        readings.append(_row(line, separator, cols, number))
+    if not numbers:
         raise TekscanError("the file does not contain any frames")
-    if len(frames[-1]) < rows:
-        raise TekscanError(
-            f"the file ends within frame {numbers[-1]}, which has {len(frames[-1])} of {rows} rows"
-        )
-    return numbers, frames, places
+    if missing := len(numbers) * rows - len(readings):
+        had = f"{rows - missing} of {rows} rows"
+        raise TekscanError(f"the file ends within frame {numbers[-1]}, which has {had}")
+    return numbers, np.array(readings).reshape(-1, rows, cols)
 
 
 def _separator(line: str, cols: int) -> str:
@@ -250,13 +215,12 @@ def _cells(line: str, separator: str, cols: int) -> list[str]:
     return cells
 
 
-def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float64]:
-    """Parse a row of readings, with −inf at positions without a cell."""
+def _row(line: str, separator: str, cols: int, number: int) -> list[float]:
+    """Parse a row of readings, with NaN at positions without a cell."""
     cells = [cell.strip(' "').upper() for cell in _cells(line, separator, cols)]
-    missing = cells.count("B")
     if separator == "," and len(cells) != cols:
         # Commas are decimal separators only if every number contains a comma.
-        if len(cells) == 2 * cols - missing:
+        if len(cells) == 2 * cols - cells.count("B"):
             parts = iter(cells)
             cells = [part if part == "B" else f"{part}.{next(parts)}" for part in parts]
         elif cols < len(cells) < 2 * cols and all(each.isdigit() or each == "B" for each in cells):
@@ -267,12 +231,9 @@ def _row(line: str, separator: str, cols: int, number: int) -> NDArray[np.float6
     if len(cells) != cols:
         raise TekscanError(f"line {number}: found {len(cells)} cells, expected {cols}")
     try:
-        values = np.array([-math.inf if cell == "B" else _number(cell) for cell in cells])
+        return [math.nan if cell == "B" else _number(cell) for cell in cells]
     except ValueError as error:
         raise TekscanError(f"line {number}: {error}") from None
-    if np.count_nonzero(np.isneginf(values)) != missing:
-        raise TekscanError(f"line {number}: found a cell that is not a number")
-    return values
 
 
 _GROUPS = str.maketrans("", "", "'\N{RIGHT SINGLE QUOTATION MARK}\N{NO-BREAK SPACE}\u202f")
@@ -288,7 +249,10 @@ def _number(text: str) -> float:
     if "," in text:
         text = text.replace("," if text.rfind(",") < text.rfind(".") else ".", "")
         text = text.replace(",", ".")
-    return float(text)
+    value = float(text)
+    if abs(value) > _NUMBER_MAX:
+        raise ValueError(f"found {text}, expected at most {_NUMBER_MAX:g}")
+    return value
 
 
 def _count(header: dict[str, str], key: str) -> int:
@@ -316,32 +280,33 @@ def _quantity(header: dict[str, str], key: str, units: dict[str, float]) -> floa
     return value * units[unit]
 
 
-def _pitch(header: dict[str, str]) -> tuple[float, float]:
-    """Return the pitch (x, y) [m] computed from the spacings in the header."""
+def _pitch(header: dict[str, str]) -> tuple[float, float] | None:
+    """Return the pitch (x, y) [m] from the spacings in the header, or None if one is missing."""
     found = []
     for key in ("COL_SPACING", "ROW_SPACING"):
-        value = _quantity(header, key, _LENGTHS) if key in header else math.nan
-        if value <= 0.0:
-            raise TekscanError(f"{key}: expected a positive length")
-        found.append(value)
-    return found[0], found[1]
+        if key in header:
+            found.append(_quantity(header, key, _LENGTHS))
+            if found[-1] <= 0.0:
+                raise TekscanError(f"{key}: expected a positive length")
+    return (found[0], found[1]) if len(found) == 2 else None
 
 
-def _unit(header: dict[str, str], pitch: tuple[float, float]) -> float:
-    """Return the unit of the readings [Pa], or 0 for raw counts."""
+def _unit(header: dict[str, str], pitch: tuple[float, float] | None) -> float | None:
+    """Return the unit of the readings [Pa], or None for raw counts."""
     text = header.get("UNITS", "")
     unit = _plain_unit(text)
     if unit in _RAW:
-        return 0.0
+        return None
     if unit in _PRESSURES:
         return _PRESSURES[unit]
-    if unit in _FORCES:  # The unit is a force per cell.
-        area = _quantity(header, "SENSEL_AREA", _AREAS) if "SENSEL_AREA" in header else math.nan
-        area = pitch[0] * pitch[1] if math.isnan(area) else area
-        if area > 0.0:
-            return _FORCES[unit] / area
+    if unit not in _FORCES:
+        raise TekscanError(f"UNITS: found {text!r}, expected RAW or a unit of pressure")
+    area = pitch[0] * pitch[1] if pitch else 0.0  # The unit is a force per cell.
+    if "SENSEL_AREA" in header:
+        area = _quantity(header, "SENSEL_AREA", _AREAS)
+    if area <= 0.0:
         raise TekscanError(f"UNITS: found {text!r}, a unit of force, which requires SENSEL_AREA")
-    raise TekscanError(f"UNITS: found {text!r}, expected RAW or a unit of pressure")
+    return _FORCES[unit] / area
 
 
 def _plain_unit(unit: str) -> str:
