@@ -353,7 +353,7 @@ def _set_up(line: ServoLine, settings: Settings, finger: int, model: ServoModel)
         wrong = row.wrong_in(raw, row.register.address) if raw else None
         if wrong is None:
             continue
-        what, value = row.register.name, row.mended(wrong)
+        what, value = row.register.name, row.corrected(wrong)
         if value == wrong:  # Only a change of the settings can correct this register.
             found.append(Finding("warn", name, row.told(wrong)))
         elif line.store(row.register.address, {servo_id: row.register.packed(value)}):

@@ -15,7 +15,7 @@ watchdog and indirect addresses on each `arm`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container
 from typing import Final, NamedTuple
 
 from softfinger.daemon.profile.settings import Settings
@@ -33,6 +33,7 @@ DRIVE_UNFIT: Final = 0b1010
 PWM_FULL: Final = 885
 _STARTUP_FIRMWARE = 45
 _POSITION_MAX = reg.COUNTS_PER_TURN - 1
+_NO_LIMIT = 1 << 32
 
 
 class Register(NamedTuple):
@@ -92,15 +93,17 @@ _AT: Final = {register.address: register for register in REGISTERS}
 class Requirement(NamedTuple):
     """Required value of a register. A wrong value results in a finding with this ``status``.
 
-    The status is ``note`` for the RAM registers that `arm` writes.
+    The status is ``note`` for the RAM registers that `arm` writes. Only the bits of ``mask`` are
+    compared and corrected.
     """
 
     register: Register
-    holds: Callable[[int], bool]
-    mended: Callable[[int], int]  # function that maps a wrong value to the correct value
-    told: Callable[[int], str]  # function that describes the wrong value and the expected value
-    status: Status
+    accepted: Container[int]
+    value: int  # correct value
+    problem: Callable[[int], str]  # describes a wrong value and the expected value
+    status: Status = "FAIL"
     then: str = ""  # action required after the value is corrected
+    mask: int = -1
 
     def wrong_in(self, table: bytes, start: int = 0) -> int | None:
         """Return the value if it is wrong, otherwise None.
@@ -108,29 +111,35 @@ class Requirement(NamedTuple):
         ``table`` contains the registers from address ``start`` on.
         """
         value = self.register.value_in(table, start)
-        return None if self.holds(value) else value
+        return None if value & self.mask in self.accepted else value
+
+    def corrected(self, wrong: int) -> int:
+        """Return the correct value of a register that contains ``wrong``."""
+        return wrong & ~self.mask | self.value
+
+    def told(self, wrong: int) -> str:
+        """Describe a wrong value and the expected value."""
+        return f"{self.register.name} {self.problem(wrong)}"
 
 
 def _exactly(address: int, value: int, why: str, status: Status = "FAIL") -> Requirement:
-    register = _AT[address]
     return Requirement(
-        register,
-        lambda found: found == value,
-        lambda _: value,
-        lambda found: f"{register.name} is {found}, expected {value}: {why}",
+        _AT[address],
+        (value,),
+        value,
+        lambda found: f"is {found}, expected {value}: {why}",
         status,
     )
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
     """Require a shutdown limit between ``low`` and the factory value ``high``."""
-    register = _AT[address]
     expected = f"{low}" if low == high else f"{low} to {high}"
     return Requirement(
-        register,
-        lambda found: low <= found <= high,
-        lambda _: high,
-        lambda found: f"{register.name} is {found} {unit}, expected {expected} {unit}",
+        _AT[address],
+        range(low, high + 1),
+        high,
+        lambda found: f"is {found} {unit}, expected {expected} {unit}",
         "warn",
     )
 
@@ -147,41 +156,35 @@ def required_registers(
     rows = [
         Requirement(
             _AT[reg.RETURN_DELAY_TIME],
-            lambda found: found <= RETURN_DELAY_MAX,
-            lambda _: 0,
-            lambda found: (
-                f"return delay is {2 * found} µs, expected at most {2 * RETURN_DELAY_MAX} µs"
-            ),
-            "FAIL",
+            range(RETURN_DELAY_MAX + 1),
+            0,
+            lambda found: f"is {2 * found} µs, expected at most {2 * RETURN_DELAY_MAX} µs",
         ),
         Requirement(
             _AT[reg.DRIVE_MODE],
-            lambda found: not found & DRIVE_UNFIT,
-            lambda found: found & ~DRIVE_UNFIT,
+            (0,),
+            0,
             lambda found: (
-                f"drive mode {found} switches torque on with any goal, or makes the servo follow "
-                "another servo"
+                f"{found} switches torque on with any goal, or makes the servo follow another servo"
             ),
-            "FAIL",
+            mask=DRIVE_UNFIT,
         ),
         Requirement(
             _AT[reg.SHADOW_ID],
-            lambda found: found not in servos.ids,
-            lambda _: 255,
+            set(range(256)) - set(servos.ids),
+            255,
             lambda found: (
-                f"shadow ID is {found}: the servo also executes commands for the servo with this ID"
+                f"is {found}: the servo also executes commands for the servo with this ID"
             ),
-            "FAIL",
         ),
         Requirement(
             _AT[reg.HOMING_OFFSET],
-            lambda found: found == 0,
-            lambda _: 0,
+            (0,),
+            0,
             lambda found: (
-                f"homing offset is {found} counts, expected 0: it shifts this joint's zero by "
+                f"is {found} counts, expected 0: it shifts this joint's zero by "
                 f"{math.degrees(abs(found) * scale.radian):.1f}°"
             ),
-            "FAIL",
             then="run `softfinger calibrate joints`, unless servos.zero was determined without "
             "the offset",
         ),
@@ -191,23 +194,24 @@ def required_registers(
         _exactly(reg.PWM_LIMIT, PWM_FULL, "the motor does not get the full supply voltage"),
         Requirement(
             _AT[reg.VELOCITY_LIMIT],
-            lambda found: found >= slow,
-            lambda _: model.velocity_limit,
+            range(slow, _NO_LIMIT),
+            model.velocity_limit,
             lambda found: (
-                f"velocity limit is {found * scale.velocity:.2g} rad/s at the joint, expected at "
-                f"least {slow * scale.velocity:.2g} rad/s"
+                f"is {found * scale.velocity:.2g} rad/s at the joint, expected at least "
+                f"{slow * scale.velocity:.2g} rad/s"
             ),
             "warn",
         ),
         Requirement(
             _AT[reg.SHUTDOWN],
-            lambda found: found & model.shutdown == model.shutdown,
-            lambda found: found | model.shutdown,
+            (model.shutdown,),
+            model.shutdown,
             lambda found: (
-                f"shutdown is {found}, expected {model.shutdown}: the servo does not switch "
-                f"torque off after {reg.hardware_error_names(model.shutdown & ~found)}"
+                f"is {found}, expected {model.shutdown}: the servo does not switch torque off "
+                f"after {reg.hardware_error_names(model.shutdown & ~found)}"
             ),
             "warn",
+            mask=model.shutdown,
         ),
     ]
     if mode in model.modes:
@@ -215,27 +219,37 @@ def required_registers(
         rows.append(
             Requirement(
                 _AT[reg.OPERATING_MODE],
-                lambda found: found == mode,
-                lambda _: mode,
+                (mode,),
+                mode,
                 lambda found: (
-                    f"operating mode is {told.get(found, str(found))} ({found}), expected "
-                    f"{told[mode]} ({mode})"
+                    f"is {told.get(found, str(found))} ({found}), expected {told[mode]} ({mode})"
                 ),
-                "FAIL",
             )
         )
     if mode == reg.POSITION_MODE:
         rows += _position_limits(scale, settings, finger)
     elif model.senses_current and safety.current_max <= model.stall_current:
-        rows.append(_current_limit(model, safety.current_max))
+        unit = model.current_unit
+        needed = math.ceil(safety.current_max / unit - 1e-9)
+        rows.append(
+            Requirement(
+                _AT[reg.CURRENT_LIMIT],
+                range(needed, _NO_LIMIT),
+                needed,
+                lambda found: (
+                    f"is {found * unit:.3f} A, expected at least safety.current_max = "
+                    f"{safety.current_max:g} A"
+                ),
+            )
+        )
     if firmware >= _STARTUP_FIRMWARE:
         why = "at power-up the servo switches torque on (1) or restores a backup of its RAM (2)"
         rows.append(_exactly(reg.STARTUP_CONFIGURATION, 0, why))
     if model.pwm_slope is not None:
         why = "the motor voltage ramps at a different rate"
-        row = _exactly(reg.PWM_SLOPE, slope := model.pwm_slope, why, "warn")
+        row = _exactly(reg.PWM_SLOPE, model.pwm_slope, why, "warn")
         # The register reads 0 if the firmware does not implement it.
-        rows.append(row._replace(holds=lambda found: found in (0, slope)))
+        rows.append(row._replace(accepted=(0, model.pwm_slope)))
     rows += armed_registers(model)
     return sorted(rows, key=lambda row: row.register.address)
 
@@ -244,36 +258,21 @@ def armed_registers(model: ServoModel) -> list[Requirement]:
     """Return the requirements for the RAM registers that `arm` writes."""
     why = "set by another program; `arm` corrects it"
     d, i, p = model.position_gains
-    values = (
-        (reg.POSITION_D_GAIN, d),
-        (reg.POSITION_I_GAIN, i),
-        (reg.POSITION_P_GAIN, p),
-        (reg.FEEDFORWARD_2ND_GAIN, 0),
-        (reg.FEEDFORWARD_1ST_GAIN, 0),
-        (reg.GOAL_PWM, PWM_FULL),
-        (reg.PROFILE_ACCELERATION, 0),
-        (reg.PROFILE_VELOCITY, 0),
-    )
-    return [_exactly(address, value, why, "note") for address, value in values]
+    values = {
+        reg.POSITION_D_GAIN: d,
+        reg.POSITION_I_GAIN: i,
+        reg.POSITION_P_GAIN: p,
+        reg.FEEDFORWARD_2ND_GAIN: 0,
+        reg.FEEDFORWARD_1ST_GAIN: 0,
+        reg.GOAL_PWM: PWM_FULL,
+        reg.PROFILE_ACCELERATION: 0,
+        reg.PROFILE_VELOCITY: 0,
+    }
+    return [_exactly(address, value, why, "note") for address, value in values.items()]
 
 
-def _current_limit(model: ServoModel, current_max: float) -> Requirement:
-    unit = model.current_unit
-    needed = math.ceil(current_max / unit - 1e-9)
-    return Requirement(
-        _AT[reg.CURRENT_LIMIT],
-        lambda found: found >= needed,
-        lambda _: needed,
-        lambda found: (
-            f"current limit is {found * unit:.3f} A, expected at least safety.current_max = "
-            f"{current_max:g} A"
-        ),
-        "FAIL",
-    )
-
-
-def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iterable[Requirement]:
-    """Yield the position limit requirements. Servos silently reject goals outside the limits."""
+def _position_limits(scale: JointScale, settings: Settings, finger: int) -> list[Requirement]:
+    """Return the position limit requirements. Servos silently reject goals outside the limits."""
     ends = (settings.hand.q_min[finger], settings.hand.q_max[finger])
     first, last = sorted(scale.position_counts(q) for q in ends)
     needed = f"the joint requires {first} to {last}"
@@ -282,17 +281,11 @@ def _position_limits(scale: JointScale, settings: Settings, finger: int) -> Iter
             ", which exceeds one turn: run `softfinger calibrate joints` to determine zero and "
             "range"
         )
-    yield Requirement(
-        _AT[reg.MIN_POSITION_LIMIT],
-        lambda found: found <= first,
-        lambda _: 0,
-        lambda found: f"min position limit is {found}, {needed}",
-        "FAIL",
+    limits = (
+        (reg.MIN_POSITION_LIMIT, range(first + 1), 0),
+        (reg.MAX_POSITION_LIMIT, range(last, _NO_LIMIT), _POSITION_MAX),
     )
-    yield Requirement(
-        _AT[reg.MAX_POSITION_LIMIT],
-        lambda found: found >= last,
-        lambda _: _POSITION_MAX,
-        lambda found: f"max position limit is {found}, {needed}",
-        "FAIL",
-    )
+    return [
+        Requirement(_AT[address], accepted, value, lambda found: f"is {found}, {needed}")
+        for address, accepted, value in limits
+    ]

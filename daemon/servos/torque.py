@@ -173,7 +173,7 @@ class Torque:
         for servo_id, table in tables.items():
             for row in armed_registers(self._model):
                 if row.wrong_in(table, reg.RAM) is not None:
-                    what, data = row.register.name, row.register.packed(row.mended(0))
+                    what, data = row.register.name, row.register.packed(row.value)
                     self._store(row.register.address, {servo_id: data}, what)
 
     # --- preconditions ---------------------------------------------------------------------------
