@@ -13,11 +13,10 @@ import select
 import time
 from pathlib import Path
 
-import serial
 from dynamixel_sdk.port_handler import PortHandler
 
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.port_access import grant, port_group_remedy
+from softfinger.daemon.port_access import open_port
 
 with contextlib.suppress(ModuleNotFoundError):  # On Windows, only simulated servos are supported.
     import termios
@@ -63,11 +62,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
 
     def openPort(self) -> bool:
         """Open the port exclusively. Raises ServoError with the reason and a fix."""
-        path = self.port_name
-        try:
-            self.ser = serial.Serial(path, self.baudrate, timeout=0, exclusive=True)
-        except (serial.SerialException, OSError, ValueError, termios.error) as error:
-            raise ServoError(_why_not(path, error)) from None
+        self.ser = open_port(self.port_name, self.baudrate, "servos.port", ServoError)
         self._descriptor = self.ser.fileno()
         try:
             if self._low_latency:
@@ -133,17 +128,3 @@ class SerialPort(PortHandler):  # type: ignore[misc]
             f"{self.port_name}: the port is lost ({error}): connect the adapter and switch on the "
             "servo supply"
         )
-
-
-def _why_not(path: str, error: Exception) -> str:
-    code = getattr(error, "errno", None)
-    if code == errno.ENOENT or not Path(path).exists():
-        return (
-            f"{path}: port not found: {port_group_remedy(path)}, or set servos.port; `softfinger "
-            "doctor` lists the available ports"
-        )
-    if code == errno.EACCES:
-        return f"{path}: no permission to open the port: {grant(path)}"
-    if code in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK) or "lock" in str(error).lower():
-        return f"{path}: the port is in use by another program: end that program first"
-    return f"{path}: can't be opened: {error}"

@@ -11,14 +11,13 @@ import errno
 import math
 import os
 import select
-import termios
 import threading
 
 import serial
 
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.port_access import grant
+from softfinger.daemon.port_access import open_port
 from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile.decoder import Decoded, Decoder
 from softfinger.daemon.types import Frame
@@ -115,7 +114,7 @@ class SerialReader:
         self._sensor_clock = SensorClock()
         self._latest, self._bytes = None, 0
         self._event.clear()
-        self._port = open_port(self._path, self.settings.baud)
+        self._port = open_port(self._path, self.settings.baud, "tactile.port", TactileError)
         self.error, self._port_lost = "", False
         self._stop = os.pipe()
         self._thread = threading.Thread(
@@ -252,22 +251,3 @@ class SerialReader:
         self._port_lost = True
         self._invalidate(why)
         self._event.set()
-
-
-def open_port(path: str, baud: int) -> serial.Serial:
-    """Open ``path`` exclusively in raw mode with 8 data bits and no parity. Raises TactileError."""
-    try:
-        return serial.Serial(path, baud, timeout=0, exclusive=True)
-    except (OSError, ValueError, termios.error) as error:
-        number = error.errno if isinstance(error, OSError) else None
-        if number == errno.ENOENT:
-            why = "port not found; check that the board is connected"
-            if not path.startswith("/dev/"):
-                why = "port not found; check that `softfinger emulate` is running"
-        elif number in (errno.EACCES, errno.EPERM):
-            why = f"no permission to open the port: {grant(path)}"
-        elif number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
-            why = "the port is in use by another program: end that program first"
-        else:
-            why = f"can't be opened as a serial port ({error})"
-    raise TactileError(f"{path}: {why}")

@@ -104,7 +104,7 @@ def test_a_frame_is_delivered_before_the_next_one_arrives(board):
 
 def test_a_port_that_cannot_be_opened_is_reported(tmp_path, board):
     missing, file = tmp_path / "tactile-left", tmp_path / "file"
-    assert "tactile-left: port not found; check that `softfinger emulate`" in why_not_open(
+    assert "tactile-left: port not found: start `softfinger emulate`" in why_not_open(
         sensor(missing)
     )
     file.write_text("")
