@@ -40,7 +40,7 @@ from softfinger.daemon.servos.exchange import (
     choose_reads,
     note_slow_replies,
 )
-from softfinger.daemon.servos.joint import Joint, JointScale
+from softfinger.daemon.servos.joint import Joint, JointScale, pack_goal
 from softfinger.daemon.servos.port import BITS_PER_BYTE, PortLost, SerialPort
 from softfinger.daemon.servos.protocol import GroupRead, PacketHandler, ServoLine
 from softfinger.daemon.servos.torque import Torque
@@ -304,7 +304,8 @@ class DynamixelServos:
         servos, mode, q, current = self._settings, self._mode, goal.q, goal.current
         values = []
         for joint in self._joints:
-            value = joint.goal(servos, mode, q[joint.finger], current[joint.finger])
+            counts = joint.goal(servos, mode, q[joint.finger], current[joint.finger])
+            value = pack_goal(mode, *counts)
             joint.sent.append(value)
             values.append(value)
         torque.goals.send(values)

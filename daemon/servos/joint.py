@@ -107,7 +107,7 @@ class Joint:
     scale: JointScale
     firmware: int = 0
     bound: int = 0  # maximum goal current in counts
-    ends: tuple[int, int] = (0, 0)  # position limits in counts
+    ends: tuple[int, int] = (-_GOAL_LIMIT, _GOAL_LIMIT)  # position limits in counts
     q: float = 0.0  # angle in the last valid reading [rad]
     dq: float = 0.0  # [rad/s]
     sent: deque[bytes] = field(default_factory=deque)  # recently sent goals as register bytes
@@ -119,8 +119,11 @@ class Joint:
         """Servo name for reports."""
         return servo_name(self.id, self.finger)
 
-    def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> bytes:
-        """Return the register bytes for a goal [rad, A] in operating mode ``mode``."""
+    def goal(self, servos: ServoSettings, mode: int, q: float, current: float) -> tuple[int, int]:
+        """Return goal current and goal position [counts] for a goal [rad, A].
+
+        In operating mode 5, the goal current is a limit and therefore positive.
+        """
         scale, position = self.scale, self.scale.position_counts(q)
         counts = bound = min(scale.bound_counts(current), self.bound)
         if mode == reg.POSITION_MODE:
@@ -128,7 +131,7 @@ class Joint:
         elif mode == reg.CURRENT_MODE:
             counts = scale.current_counts(current_toward(servos, q, current, self.q, self.dq))
             counts = min(max(counts, -bound), bound)
-        return pack_goal(mode, counts, position)
+        return counts, position
 
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:

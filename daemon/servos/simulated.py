@@ -3,41 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from softfinger.daemon.clock import Clock
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.base import JointPlant
 from softfinger.daemon.servos.checks import check_model
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.servos.joint import JointScale, current_toward
+from softfinger.daemon.servos.joint import Joint, JointScale
 from softfinger.daemon.types import Goal, Reading
+
+if TYPE_CHECKING:
+    from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 
 _HEALTH_INTERVAL = 0.25  # time between temperature and supply voltage readings [s]
 _OVERLOAD_TIME = 2.0  # time at maximum current after which an overload error occurs [s]
-
-
-class MotorHeat(Protocol):
-    """Thermal model of a motor."""
-
-    sensed: float  # thermometer reading [°C]
-
-    def step(self, current: float, seconds: float) -> None:
-        """Advance by ``seconds`` with a constant ``current`` [A]."""
-
-
-class HandPlant(JointPlant, Protocol):
-    """Joints of the simulated hand, including the servos' watchdogs and temperatures."""
-
-    @property
-    def servo_heat(self) -> Sequence[MotorHeat]:
-        """Thermal model of each joint's motor."""
-
-    def hold_torque_until(self, t: float) -> None:
-        """Switch torque off at time ``t`` [s], unless the method is called again before ``t``."""
 
 
 class SimulatedServos:
@@ -48,14 +29,17 @@ class SimulatedServos:
     again.
     """
 
-    def __init__(self, settings: Settings, hand: HandPlant, clock: Clock) -> None:
+    def __init__(self, settings: Settings, hand: SimulatedHand, clock: Clock) -> None:
         self._settings = settings.servos
         self._mode = reg.MODE_NUMBERS[settings.servos.mode]
         self._model = by_name(settings.servos.model)
         self._hand = hand
         self._clock = clock
-        self._joints = settings.scene.indices
-        self._scales = [JointScale.of(settings.servos, i, self._model) for i in range(2)]
+        self._joints = []
+        for i in settings.scene.indices:
+            scale = JointScale.of(settings.servos, i, self._model)
+            bound = scale.bound_counts(settings.servos.current_limit[i])
+            self._joints.append(Joint(i, settings.servos.ids[i], scale, bound=bound))
         self._watchdog = settings.servos.watchdog or math.inf
         self._connected = False
         self._torque = False
@@ -64,8 +48,6 @@ class SimulatedServos:
         self._last = -math.inf  # time of the last exchange [s]
         self._goal_q = [0.0, 0.0]
         self._goal_current = [0.0, 0.0]
-        self._q = [0.0, 0.0]  # last readings of angle [rad] and velocity [rad/s]
-        self._dq = [0.0, 0.0]
         self._errors = [0, 0]  # hardware error bits
         self._pressed = [0.0, 0.0]  # time for which each motor has drawn its maximum current [s]
         self._health_read = -math.inf
@@ -88,11 +70,11 @@ class SimulatedServos:
         # Convert the arrays to lists, because reading single elements of an array is slow.
         q, dq = self._hand.q.tolist(), self._hand.dq.tolist()
         for joint in self._joints:
-            scale = self._scales[joint]
-            reading.q[joint] = self._q[joint] = scale.angle(scale.position_counts(q[joint]))
-            reading.dq[joint] = self._dq[joint] = scale.rate(scale.velocity_counts(dq[joint]))
-            current = self._hand.measured_current(joint)
-            reading.current[joint] = scale.amperes(scale.current_counts(current))
+            f, scale = joint.finger, joint.scale
+            reading.q[f] = joint.q = scale.angle(scale.position_counts(q[f]))
+            reading.dq[f] = joint.dq = scale.rate(scale.velocity_counts(dq[f]))
+            current = self._hand.measured_current(f)
+            reading.current[f] = scale.amperes(scale.current_counts(current))
         if reading.t - self._health_read >= _HEALTH_INTERVAL:
             self._read_health(reading)
         reading.seq += 1
@@ -104,22 +86,22 @@ class SimulatedServos:
         currents = [abs(each) for each in self._hand.current.tolist()]
         voltage = self._model.supply - reg.SAG * sum(currents)
         reading.alert = 0
-        for joint in self._joints:
-            heat, current = self._hand.servo_heat[joint], currents[joint]
+        for f in (joint.finger for joint in self._joints):
+            heat, current = self._hand.servo_heat[f], currents[f]
             heat.step(current, passed)
-            reading.temperature[joint] = float(round(heat.sensed))
-            reading.voltage[joint] = round(voltage / reg.VOLTAGE_UNIT) * reg.VOLTAGE_UNIT
-            limit = min(self._settings.current_limit[joint], self._model.stall_current)
+            reading.temperature[f] = float(round(heat.sensed))
+            reading.voltage[f] = round(voltage / reg.VOLTAGE_UNIT) * reg.VOLTAGE_UNIT
+            limit = min(self._settings.current_limit[f], self._model.stall_current)
             pressed = self._torque and current >= 0.99 * limit
-            self._pressed[joint] = self._pressed[joint] + passed if pressed else 0.0
+            self._pressed[f] = self._pressed[f] + passed if pressed else 0.0
             hot = heat.sensed > self._model.temperature_limit
-            over = self._pressed[joint] > _OVERLOAD_TIME
+            over = self._pressed[f] > _OVERLOAD_TIME
             errors = hot << reg.OVERHEATING | over << reg.OVERLOAD
             # A servo keeps an error until a reboot; a simulated servo, until torque is off.
-            errors |= self._errors[joint] if self._torque else 0
-            self._errors[joint] = errors
-            reading.hardware[joint] = errors
-            reading.alert |= bool(errors) << joint
+            errors |= self._errors[f] if self._torque else 0
+            self._errors[f] = errors
+            reading.hardware[f] = errors
+            reading.alert |= bool(errors) << f
         if reading.alert and self._torque:
             self._drive()
 
@@ -129,9 +111,9 @@ class SimulatedServos:
             raise ServoError("the simulated servos are not connected")
         self._exchange()
         for joint in self._joints:
-            scale = self._scales[joint]
-            self._goal_q[joint] = scale.angle(scale.position_counts(float(self._hand.q[joint])))
-            self._goal_current[joint] = 0.0
+            f, scale = joint.finger, joint.scale
+            self._goal_q[f] = scale.angle(scale.position_counts(float(self._hand.q[f])))
+            self._goal_current[f] = 0.0
         self._switch(True)
 
     def torque_off(self, reading: Reading) -> bool:
@@ -154,17 +136,11 @@ class SimulatedServos:
                 "servos.watchdog: send `clear`, then `arm`"
             )
         for joint in self._joints:
-            scale = self._scales[joint]
-            self._goal_q[joint] = scale.angle(scale.position_counts(goal.q[joint]))
-            limit = self._settings.current_limit[joint]
-            bound = scale.bound_counts(min(abs(goal.current[joint]), limit))
-            current = bound * scale.current_unit
-            if self._mode == reg.CURRENT_MODE:  # The daemon controls the position.
-                q, dq = self._q[joint], self._dq[joint]
-                current = current_toward(self._settings, goal.q[joint], current, q, dq)
-                counts = min(max(scale.current_counts(current), -bound), bound)
-                current = scale.amperes(counts)
-            self._goal_current[joint] = current
+            f, scale = joint.finger, joint.scale
+            counts, position = joint.goal(self._settings, self._mode, goal.q[f], goal.current[f])
+            signed = self._mode == reg.CURRENT_MODE
+            self._goal_q[f] = scale.angle(position)
+            self._goal_current[f] = scale.amperes(counts) if signed else counts * scale.current_unit
         self._drive()
 
     def counters(self) -> dict[str, int]:
@@ -198,8 +174,7 @@ class SimulatedServos:
         self._drive()
 
     def _drive(self) -> None:
-        for joint in self._joints:
-            goal_q, goal_current = self._goal_q[joint], self._goal_current[joint]
+        for f in (joint.finger for joint in self._joints):
             # Like a real servo, apply torque only if no hardware error has occurred.
-            torque = self._torque and not self._errors[joint]
-            self._hand.drive(joint, self._mode, torque, goal_q, goal_current)
+            torque = self._torque and not self._errors[f]
+            self._hand.drive(f, self._mode, torque, self._goal_q[f], self._goal_current[f])
