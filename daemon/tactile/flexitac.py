@@ -8,6 +8,7 @@ checksum. The bytes ``AA 55`` may also occur among the counts.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter, deque
 from itertools import combinations
 from typing import Literal
@@ -19,7 +20,8 @@ from softfinger.daemon.tactile.serial_reader import BITS_PER_BYTE, SerialReader
 
 MARKER = b"\xaa\x55"
 _SEARCH_FRAME_COUNT = 12  # number of frames that a search compares before it drops the oldest frame
-_MARKER_COUNT_MAX = 96  # maximum number of stored markers, from which the grid size is estimated
+_SAMPLE_SIZE = 1 << 19  # bytes of an unreadable stream from which the grid size is estimated
+_MARKER_COUNT_MAX = 96  # maximum number of markers in the sample that are compared
 _GAP_TIME = 1e-3  # minimum gap between frames [s]
 _CELL_COUNT_MIN = 16  # minimum number of cells between two markers
 
@@ -53,13 +55,14 @@ class FlexiTacDecoder(Decoder):
         # Stream position of the end, and read time [s], of each buffered piece.
         self._pieces: deque[tuple[int, float]] = deque()
         self._ambiguous = 0
-        self._markers: deque[int] = deque(
-            maxlen=_MARKER_COUNT_MAX
-        )  # stream positions of the markers found while not locked
+        self._sample = bytearray()  # newest bytes received while not locked
 
     def feed(self, data: bytes, t: float) -> Decoded | None:
         self._buffer += data
         self._pieces.append((self._start + len(self._buffer), t))
+        if not self.locked:
+            self._sample += data
+            del self._sample[:-_SAMPLE_SIZE]
         newest = None
         while self.locked or self._search():
             if self._misplaced(0) or self._misplaced(self.frame_bytes):
@@ -83,7 +86,8 @@ class FlexiTacDecoder(Decoder):
     @property
     def found_cells(self) -> int:
         """Number of cells per frame, based on the most common marker spacing; 0 while locked."""
-        apart = Counter(b - a for a, b in combinations(self._markers, 2))
+        markers = [found.start() for found in re.finditer(MARKER, self._sample)]
+        apart = Counter(b - a for a, b in combinations(markers[-_MARKER_COUNT_MAX:], 2))
         spacings = [each for each in apart if each >= _CELL_COUNT_MIN + len(MARKER)]
         spacing = max(spacings, key=lambda each: (apart[each], -each), default=0)
         return spacing - len(MARKER) if apart[spacing] > 2 and spacing != self.frame_bytes else 0
@@ -106,7 +110,7 @@ class FlexiTacDecoder(Decoder):
                 f"found the AA 55 marker several times in each frame of {expected}, so the frame "
                 "boundary is ambiguous: load the sensor differently"
             )
-        if self._markers:
+        if MARKER in self._sample:
             return (
                 f"found AA 55 markers, but not at the intervals expected for frames of {expected}"
             )
@@ -124,20 +128,17 @@ class FlexiTacDecoder(Decoder):
                 self._skip(len(buffer) - buffer.endswith(MARKER[:1]))
                 return False
             self._skip(marker)
-            self._note(0)
             verdict = self._only_place()
             if verdict == "undecided":
                 return False
             if verdict == "yes":
                 self.locked = True
-                self._markers.clear()
+                self._sample.clear()
                 return True
             if verdict == "no":
                 self._skip(len(MARKER))
                 continue
             self._ambiguous += 1
-            for rival in self._between():
-                self._note(rival)
             self._skip(stride)
 
     def _only_place(self) -> Literal["yes", "no", "undecided", "ambiguous"]:
@@ -147,7 +148,8 @@ class FlexiTacDecoder(Decoder):
         stream is split into reads.
         """
         buffer, stride = self._buffer, self.frame_bytes
-        rivals = self._between()
+        between = re.finditer(MARKER, buffer[len(MARKER) : stride])
+        rivals = [len(MARKER) + found.start() for found in between]
         for level in range(1, _SEARCH_FRAME_COUNT + 1):
             here = level * stride
             if len(buffer) < here + len(MARKER):
@@ -160,15 +162,6 @@ class FlexiTacDecoder(Decoder):
             if not rivals:
                 return "yes"
         return "ambiguous"
-
-    def _between(self) -> list[int]:
-        """Return the positions of ``AA 55`` between the first two markers in the buffer."""
-        markers = []
-        marker = self._buffer.find(MARKER, len(MARKER), self.frame_bytes)
-        while marker >= 0:
-            markers.append(marker)
-            marker = self._buffer.find(MARKER, marker + len(MARKER), self.frame_bytes)
-        return markers
 
     def _misplaced(self, marker: int) -> bool:
         """Return True if the buffered bytes at position ``marker`` can't be a marker."""
@@ -200,8 +193,8 @@ class FlexiTacDecoder(Decoder):
     def _lose(self) -> None:
         self.locked = False
         self._resyncs += 1
+        self._sample += self._buffer
         if self._buffer.startswith(MARKER):  # The marker belongs to an incomplete frame.
-            self._note(0)
             self._skip(len(MARKER))
 
     def _skip(self, count: int) -> None:
@@ -214,11 +207,6 @@ class FlexiTacDecoder(Decoder):
         self._start += count
         while self._pieces and self._pieces[0][0] <= self._start:
             self._pieces.popleft()
-
-    def _note(self, marker: int) -> None:
-        marker += self._start
-        if not self._markers or marker > self._markers[-1]:
-            self._markers.append(marker)
 
 
 class FlexiTac(SerialReader):
