@@ -18,12 +18,16 @@ class Clock(Protocol):
     """Time source of the pipeline; all times are in seconds."""
 
     pauses_when_late: bool  # True if the hand's clock pauses while this machine is late
+    behind: float  # total time by which `now` lags behind the machine's clock [s]
 
     def now(self) -> float:
         """Return the monotonic time [s]."""
 
     def wall(self) -> float:
         """Return the Unix time [s] that corresponds to `now`."""
+
+    def host(self) -> float:
+        """Return the machine's monotonic time [s] for measuring computation times and delays."""
 
     def sleep_until(self, t: float) -> float:
         """Sleep until monotonic time ``t`` and return the wake-up delay [s].
@@ -32,16 +36,7 @@ class Clock(Protocol):
         """
 
 
-class LoopClock(Clock, Protocol):
-    """Clock that drives the loop and also provides the machine's real time."""
-
-    behind: float  # total time by which `now` lags behind the machine's clock [s]
-
-    def host(self) -> float:
-        """Return the machine's monotonic time [s] for measuring computation times and delays."""
-
-
-def make_clock(settings: Settings) -> LoopClock:
+def make_clock(settings: Settings) -> Clock:
     """Return the clock selected by ``loop.clock``."""
     name = settings.loop.clock
     if name == "auto":
@@ -136,8 +131,10 @@ class HandClock:
 
     pauses_when_late = True
 
-    def __init__(self, machine: LoopClock, due: Deadline | None = None) -> None:
+    def __init__(self, machine: Clock, due: Deadline | None = None) -> None:
         self._machine = machine
+        self.wall = machine.wall
+        self.host = machine.host
         self._due = due
         self._now = machine.now()
         self.behind = 0.0
@@ -145,14 +142,6 @@ class HandClock:
     def now(self) -> float:
         """Return the hand's time [s], which is the deadline of the last sleep."""
         return self._now
-
-    def wall(self) -> float:
-        """Return the machine's Unix time [s]."""
-        return self._machine.wall()
-
-    def host(self) -> float:
-        """Return the machine's monotonic time [s]."""
-        return self._machine.host()
 
     def sleep_until(self, t: float) -> float:
         """Sleep until the hand's time is ``t``; add any delay of the machine to ``behind``."""

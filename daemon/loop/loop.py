@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from softfinger.daemon.clock import LoopClock
+from softfinger.daemon.clock import Clock
 from softfinger.daemon.control.modes import GRIPPING_MODES, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskEnded
@@ -60,7 +60,7 @@ class Loop:
     def __init__(
         self,
         settings: Settings,
-        clock: LoopClock,
+        clock: Clock,
         servos: Servos | None,
         perception: Perception,
         publisher: Publisher | None,
@@ -283,20 +283,9 @@ class Loop:
     def command(
         self, request: dict[str, Any], age: float = 0.0, by_task: bool = False
     ) -> dict[str, Any]:
-        """Execute one request on the current tick.
+        """Execute one request on the current tick; see `Requests.carry_out`.
 
-        A request from any other source ends a running task.
-
-        Parameters
-        ----------
-        request : command with its parameters
-        age : time since the request arrived [s]
-        by_task : True if the request comes from the running task
-
-        Raises
-        ------
-        Refused
-            If the request is rejected. The message gives the reason.
+        A request from any source other than the running task ends the task.
         """
         name = request["command"]
         if name == "status":

@@ -108,13 +108,8 @@ class _Servos:
         reading.lost = said.get("lost", 0)
         reading.frozen = said.get("frozen", 0)
         for finger, name in enumerate(FINGERS):
-            part = taken[name]
-            reading.q[finger] = part["q"]
-            reading.dq[finger] = part["dq"]
-            reading.current[finger] = part["current"]
-            reading.hardware[finger] = part["hardware"]
-            reading.temperature[finger] = part["temperature"]
-            reading.voltage[finger] = part["voltage"]
+            for field in ("q", "dq", "current", "hardware", "temperature", "voltage"):
+                getattr(reading, field)[finger] = taken[name][field]
         if said["error"]:
             raise ServoError(said["error"])
 

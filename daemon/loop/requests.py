@@ -92,12 +92,19 @@ def bounds(settings: Settings, parameter: str) -> tuple[float, float]:
     return _COMPLIANCE_RANGE if parameter == "compliance" else (-math.inf, math.inf)
 
 
+def _out_of_range(key: str, value: float, low: float, high: float) -> str:
+    if key in FINGERS:
+        return range_text(value, low, high)
+    if key == "force":
+        return f"found {value:g} N, expected more than {low:g} N and at most {high:g} N"
+    return f"found {value:g} rad/(N·m), expected {low:g} to {high:g}"
+
+
 class Lease:
     """Exclusive control of the hand by one client.
 
-    The lease expires after a period without commands from the client.
-
-    All unnamed clients share one lease. Commands that can only make the hand safer require no
+    The lease expires after a period without commands from the client. All unnamed clients share one
+    lease. Commands that can only make the hand safer require no
     lease. Commands of a task require no lease and end any lease, so every client can take over from
     a task.
     """
@@ -149,10 +156,8 @@ class Requests:
     ) -> None:
         """Create the executor.
 
-        Parameters
-        ----------
-        emit : function that sends an event
-        command_age_max : maximum age [s] of a command that switches torque on or moves the hand
+        ``command_age_max`` is the maximum age [s] of a command that switches torque on or moves
+        the hand.
         """
         self._command_age_max = command_age_max
         self._settings = settings
@@ -288,18 +293,16 @@ class Requests:
             refuse_if(not fingers, Reason.SCENE, "this scene has no tactile sensors")
             touched = any(contact.contact for contact in state.contacts)
             refuse_if(touched, Reason.STATE, "a tip is in contact; remove the load from both tips")
-        elif name == "move":
-            self._check_move(numbers)
         elif name == "demo":
             text = (
                 "the profile does not define a task; run one that does, for example "
                 "`softfinger run --config demo`"
             )
             refuse_if(settings.task.name == "none", Reason.SCENE, text)
-        elif name == "hold":
-            refuse_if(
-                not numbers, Reason.REQUEST, "found neither force nor angle, expected at least one"
-            )
+        elif name in ("move", "hold"):
+            one, other = COMMANDS[name].parameters
+            text = f"found neither {one} nor {other}, expected at least one"
+            refuse_if(not numbers, Reason.REQUEST, text)
         if grasps:
             taring = any(perception.is_taring for perception in fingers)
             refuse_if(taring, Reason.STATE, "a tare is in progress")
@@ -308,10 +311,14 @@ class Requests:
             text = 'servos.mode = "position" does not limit the current; select another mode'
             refuse_if(settings.servos.mode == "position", Reason.SCENE, text)
             numbers.setdefault("force", settings.control.force_default)
-        if "force" in numbers:
-            force, (low, high) = numbers["force"], bounds(settings, "force")
-            text = f"force: found {force:g} N, expected more than {low:g} N and at most {high:g} N"
-            refuse_if(not low < force <= high, Reason.BOUNDS, text)
+        for key, value in numbers.items():
+            missing = key in FINGERS and key not in settings.scene.fingers
+            refuse_if(missing, Reason.SCENE, f"this scene has no {key} finger")
+            low, high = bounds(settings, key)
+            is_inside = low <= value <= high and not (key == "force" and value == low)
+            refuse_if(
+                not is_inside, Reason.BOUNDS, f"{key}: {_out_of_range(key, value, low, high)}"
+            )
         if "angle" in numbers:
             turns = len(settings.scene.fingers) == 2 and settings.scene.object_model
             text = "an angle requires two fingers and scene.object_model = true"
@@ -319,20 +326,6 @@ class Requests:
             if self._control.mode in HOLDING_MODES and (name == "rotate" or not state.object.valid):
                 text = self._control.fingers.turn_refusal(numbers["angle"])
                 refuse_if(text, Reason.BOUNDS if state.object.valid else Reason.STATE, text)
-        if name == "set":
-            compliance, (low, high) = numbers["compliance"], bounds(settings, "compliance")
-            text = f"compliance: found {compliance:g} rad/(N·m), expected {low:g} to {high:g}"
-            refuse_if(not low <= compliance <= high, Reason.BOUNDS, text)
-
-    def _check_move(self, numbers: dict[str, float]) -> None:
-        if not numbers:
-            raise _malformed("move: found neither left nor right, expected at least one")
-        for name, q in numbers.items():
-            if name not in self._settings.scene.fingers:
-                raise Refused(f"move: this scene has no {name} finger", Reason.SCENE)
-            low, high = bounds(self._settings, name)
-            if not low <= q <= high:
-                raise Refused(f"move: {name}: {range_text(q, low, high)}", Reason.BOUNDS)
 
     def _reconnect(self) -> None:
         """Reconnect servos that have stopped responding. Only ``clear`` calls this method.
