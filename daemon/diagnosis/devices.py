@@ -29,6 +29,7 @@ from softfinger.daemon.servos.checks import (
     Examined,
     check_latency_timer,
     examine,
+    latency_file,
 )
 from softfinger.daemon.servos.control_table import ServoModel, by_name
 from softfinger.daemon.servos.exchange import (
@@ -38,7 +39,6 @@ from softfinger.daemon.servos.exchange import (
     time_exchanges,
 )
 from softfinger.daemon.servos.joint import GOAL_SIZE
-from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import GroupWrite, ServoLine, open_line
 from softfinger.daemon.servos.provisioning import (
     FACTORY_ID,
@@ -105,9 +105,7 @@ def _try_exchange(
     ids = [each.id for each in found]
     firmwares = [each.table[reg.FIRMWARE_VERSION] for each in found]
     try:
-        reads, results = choose_reads(
-            line.port, line.handler, ids, all(map(model.fast_read, firmwares))
-        )
+        reads, results = choose_reads(line, ids, all(map(model.fast_read, firmwares)))
     except ServoError as error:
         return [Finding("FAIL", "exchange", str(error))]
     mode = reg.MODE_NUMBERS[settings.servos.mode]

@@ -187,18 +187,12 @@ class Requests:
     def carry_out(
         self, request: dict[str, Any], age: float = 0.0, by_task: bool = False
     ) -> dict[str, Any]:
-        """Execute a request on the current tick and return the reply.
+        """Execute a request, a command with its parameters, on the current tick.
 
-        Parameters
-        ----------
-        request : command with its parameters
-        age : time since the request arrived [s]
-        by_task : True if the request comes from a task
+        ``age`` is the time since the request arrived [s]. ``by_task`` is True if the request comes
+        from a task. Returns the reply.
 
-        Raises
-        ------
-        Refused
-            If the request is rejected. The message gives the reason.
+        Raises Refused if the request is rejected. The message gives the reason.
         """
         state, control = self._state, self._control
         # Accept a stop command in every mode, from every client and with unknown fields.
@@ -330,10 +324,7 @@ class Requests:
     def _reconnect(self) -> None:
         """Reconnect servos that have stopped responding. Only ``clear`` calls this method.
 
-        Raises
-        ------
-        Refused
-            If the servos cannot be connected. The message lists all problems found.
+        Raises Refused if the servos cannot be connected. The message lists all problems found.
         """
         state = self._state
         silent = state.t - state.reading.t > self._settings.servos.fault_after
@@ -354,10 +345,7 @@ class Requests:
 
         Only ``clear`` and ``arm`` reopen sensors, and only while torque is off.
 
-        Raises
-        ------
-        Refused
-            If ``clear`` cannot reopen a sensor. A hand may be armed without sensors.
+        Raises Refused if ``clear`` cannot reopen a sensor. A hand may be armed without sensors.
         """
         if self._state.torque:
             return

@@ -6,6 +6,7 @@ The checks read registers but do not change them.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,6 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding, Status
 from softfinger.daemon.servos.control_table import ServoModel
 from softfinger.daemon.servos.joint import JointScale, servo_name
-from softfinger.daemon.servos.port import latency_file
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
@@ -32,6 +32,7 @@ OLD_PROTOCOL = (
     "select Protocol 2.0 with the manufacturer's DYNAMIXEL Wizard (register 13; MX servos "
     "require firmware for Protocol 2.0), or use another servo",
 )
+_SYSFS = Path("/sys/class/tty")
 _WATCHDOG_FIRMWARE = 38
 _FAULT_AFTER_LONG = 0.5  # value of servos.fault_after above which a notice is issued [s]
 _CONSTANT_RATIO_MAX = 1.3  # maximum ratio of a torque constant to its data sheet value
@@ -309,6 +310,12 @@ def check_position(
     counts_down = bool(table[reg.DRIVE_MODE] & DRIVE_REVERSE)
     is_reversed = counts_down and -reg.COUNTS_PER_TURN < counts <= 0
     return check_angle(name, scale, counts, hand, finger, is_reversed)
+
+
+def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:
+    """Return the kernel file of an adapter's latency timer [ms], or None if it has no timer."""
+    place = sysfs / Path(os.path.realpath(path)).name / "device" / "latency_timer"
+    return place if place.exists() else None
 
 
 def check_latency_timer(path: str, reply_timeout: float, *sysfs: Path) -> Finding | None:

@@ -305,10 +305,7 @@ MODELS: Final = {row[0]: ServoModel(*row) for row in _MODELS}
 def by_name(name: str) -> ServoModel:
     """Return the model with this name; a connector suffix (``-T``, ``-R``) is optional.
 
-    Raises
-    ------
-    KeyError
-        If the model is unknown. The message lists the known models.
+    Raises KeyError if the model is unknown. The message lists the known models.
     """
     plain = name.upper().removesuffix("-T").removesuffix("-R")
     model = MODELS.get(plain)

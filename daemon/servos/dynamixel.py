@@ -41,8 +41,14 @@ from softfinger.daemon.servos.exchange import (
     note_slow_replies,
 )
 from softfinger.daemon.servos.joint import Joint, JointScale, pack_goal
-from softfinger.daemon.servos.port import BITS_PER_BYTE, PortLost, SerialPort
-from softfinger.daemon.servos.protocol import GroupRead, PacketHandler, ServoLine
+from softfinger.daemon.servos.protocol import (
+    BITS_PER_BYTE,
+    GroupRead,
+    PacketHandler,
+    PortLost,
+    SerialPort,
+    ServoLine,
+)
 from softfinger.daemon.servos.torque import Torque
 from softfinger.daemon.types import FINGERS, Goal, Reading
 
@@ -149,7 +155,7 @@ class DynamixelServos:
             notices = self._judge(examine(line, self._profile, model), port, allowed)
             claims = all(model.fast_read(joint.firmware) for joint in self._joints)
             ids = [joint.id for joint in self._joints]
-            reads, more = choose_reads(port, self._handler, ids, claims)
+            reads, more = choose_reads(line, ids, claims)
             more += note_slow_replies(port, reads, self._profile)
         finally:
             port.reply_timeout = allowed
@@ -198,13 +204,7 @@ class DynamixelServos:
     # --- the tick --------------------------------------------------------------------------------
 
     def read(self, reading: Reading) -> None:
-        """Update ``reading`` with one group read, and repeat the read once after a corrupted reply.
-
-        Raises
-        ------
-        ServoError
-            If the port is lost, or a servo has been stopped by its bus watchdog.
-        """
+        """Update ``reading`` with one group read; repeat the read once after a corrupted reply."""
         now = self._clock.now()
         if now >= self._next_health:
             self._next_health = now + _HEALTH_INTERVAL
@@ -291,13 +291,7 @@ class DynamixelServos:
                 reading.hardware[joint.finger] = errors.data[joint.id][0]
 
     def write(self, goal: Goal) -> None:
-        """Send the goal angles and current limits if this object has switched torque on.
-
-        Raises
-        ------
-        ServoError
-            If the port has been lost.
-        """
+        """Send the goal angles and current limits if this object has switched torque on."""
         torque = self._torque
         if torque is None or torque.goals is None:
             return
@@ -311,25 +305,13 @@ class DynamixelServos:
         torque.goals.send(values)
 
     def torque_on(self) -> None:
-        """Switch torque on at the current angle with zero motor current, and verify the result.
-
-        Raises
-        ------
-        ServoError
-            If torque could not be switched on or verified. Torque may be on.
-        """
+        """Switch torque on; see `Torque.on`."""
         if self._torque is None or self._reads is None:
             raise ServoError("servos: not connected")
         self._torque.on()
 
     def torque_off(self, reading: Reading) -> bool:
-        """Request torque off and read the servos; return True if all servos confirm torque off.
-
-        Raises
-        ------
-        ServoError
-            If the port has been lost.
-        """
+        """Request torque off and read the servos; return True if all servos confirm torque off."""
         torque = self._torque
         if torque is None:
             raise ServoError("servos: not connected")
@@ -351,7 +333,6 @@ class DynamixelServos:
     # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        """Return the number of failed exchanges since the start, by type."""
         handler = self._handler
         return {
             "timeouts": handler.timeouts,

@@ -17,8 +17,13 @@ from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding, Status
-from softfinger.daemon.servos.port import SerialPort
-from softfinger.daemon.servos.protocol import TRY_COUNT, FastGroupRead, GroupRead, PacketHandler
+from softfinger.daemon.servos.protocol import (
+    TRY_COUNT,
+    FastGroupRead,
+    GroupRead,
+    SerialPort,
+    ServoLine,
+)
 
 Span = tuple[int, int]  # first and last address
 # Register spans that are read in one exchange. Most ticks read PRESENT. CHECK adds the goals and
@@ -44,21 +49,15 @@ _FAILED_FRACTION_WARN, _FAILED_FRACTION_FAIL = 0.02, 0.2
 class TickReads:
     """Group reads of a tick, one for each register span and length."""
 
-    def __init__(
-        self,
-        port: SerialPort,
-        handler: PacketHandler,
-        ids: Sequence[int],
-        kind: type[GroupRead],
-    ) -> None:
+    def __init__(self, line: ServoLine, ids: Sequence[int], kind: type[GroupRead]) -> None:
         self.spans = {
             (first, last): [
-                kind(port, handler, first - more, last + 1 - first + more, ids)
+                kind(line, first - more, last + 1 - first + more, ids)
                 for more in range(LENGTH_COUNT)
             ]
             for first, last in (PRESENT, CHECK, HEALTH, ENABLED)
         }
-        self.errors = kind(port, handler, reg.HARDWARE_ERROR_STATUS, 1, ids)
+        self.errors = kind(line, reg.HARDWARE_ERROR_STATUS, 1, ids)
 
     def answered(self) -> bool:
         """Return True if all servos respond to each group read."""
@@ -69,7 +68,7 @@ class TickReads:
 
 
 def choose_reads(
-    port: SerialPort, handler: PacketHandler, ids: Sequence[int], claims_fast: bool
+    line: ServoLine, ids: Sequence[int], claims_fast: bool
 ) -> tuple[TickReads, list[Finding]]:
     """Return the fastest group reads that all servos support, and a list of notices.
 
@@ -79,16 +78,16 @@ def choose_reads(
     """
     notices: list[Finding] = []
     if claims_fast:
-        reads = TickReads(port, handler, ids, FastGroupRead)
+        reads = TickReads(line, ids, FastGroupRead)
         if reads.answered():
             return reads, notices
         text = "the servos do not reply to fast sync reads, although their firmware supports them"
         notices.append(Finding("warn", "servos", text, "the daemon uses slower normal sync reads"))
-    reads = TickReads(port, handler, ids, GroupRead)
+    reads = TickReads(line, ids, GroupRead)
     if not reads.answered():
         listed = ", ".join(map(str, ids))
         raise ServoError(
-            f"{port.port_name}: the servos (IDs {listed}) reply to single reads, but not to a "
+            f"{line.port.port_name}: the servos (IDs {listed}) reply to single reads, but not to a "
             "sync read of all servos: check the cables between the servos, and lower servos.baud"
         )
     return reads, notices

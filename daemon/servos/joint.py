@@ -15,13 +15,13 @@ from softfinger.daemon.types import FINGERS
 
 _GOAL_LIMIT = 1_048_575  # maximum goal in multi-turn modes [counts]
 _CURRENT_AND_POSITION = struct.Struct("<hi")
-_CURRENT = struct.Struct("<h")
-_POSITION = struct.Struct("<i")
-GOAL_SIZE: Final = {
-    reg.CURRENT_BASED_POSITION_MODE: _CURRENT_AND_POSITION.size,
-    reg.CURRENT_MODE: _CURRENT.size,
-    reg.POSITION_MODE: _POSITION.size,
+# Part of the bytes of goal current and goal position that an operating mode uses.
+_GOAL: Final = {
+    reg.CURRENT_BASED_POSITION_MODE: slice(0, 6),
+    reg.CURRENT_MODE: slice(0, 2),
+    reg.POSITION_MODE: slice(2, 6),
 }
+GOAL_SIZE: Final = {mode: part.stop - part.start for mode, part in _GOAL.items()}
 
 
 def servo_name(servo_id: int, finger: int) -> str:
@@ -136,17 +136,10 @@ class Joint:
 
 def pack_goal(mode: int, current: int, position: int) -> bytes:
     """Return the register bytes for a goal [counts] in operating mode ``mode``."""
-    if mode == reg.POSITION_MODE:
-        return _POSITION.pack(position)
-    if mode == reg.CURRENT_MODE:
-        return _CURRENT.pack(current)
-    return _CURRENT_AND_POSITION.pack(current, position)
+    return _CURRENT_AND_POSITION.pack(current, position)[_GOAL[mode]]
 
 
 def goal_in(mode: int, table: bytes, start: int) -> bytes:
     """Return a servo's goal bytes. ``table`` contains the registers from address ``start`` on."""
-    current = table[reg.GOAL_CURRENT - start : reg.GOAL_CURRENT - start + _CURRENT.size]
-    position = table[reg.GOAL_POSITION - start : reg.GOAL_POSITION - start + _POSITION.size]
-    if mode == reg.POSITION_MODE:
-        return position
-    return current if mode == reg.CURRENT_MODE else current + position
+    current, position = reg.GOAL_CURRENT - start, reg.GOAL_POSITION - start
+    return (table[current : current + 2] + table[position : position + 4])[_GOAL[mode]]

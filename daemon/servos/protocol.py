@@ -1,7 +1,7 @@
-"""Implement the client side of Protocol 2.0: packet handler, group exchanges and single servos.
+"""Implement the client side of Protocol 2.0: port, packets, group exchanges and single servos.
 
-This module and :mod:`servos.port` override the following behaviour of the SDK (3.7.31 to 4.1.0).
-All other SDK functions are used unchanged.
+This module overrides the following behaviour of the SDK (3.7.31 to 4.1.0). All other SDK functions
+are used unchanged.
 
 - ``txPacket`` discards the stuffed packet, so the sequence FF FF FD in a goal is sent without
   stuffing and is misinterpreted.
@@ -21,31 +21,32 @@ All other SDK functions are used unchanged.
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
+import os
+import select
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from dynamixel_sdk import robotis_def as sdk
+from dynamixel_sdk.port_handler import PortHandler
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
-from dynamixel_sdk.robotis_def import (
-    BROADCAST_ID,
-    COMM_RX_CORRUPT,
-    COMM_RX_TIMEOUT,
-    COMM_SUCCESS,
-    COMM_TX_FAIL,
-    INST_PING,
-    INST_READ,
-    INST_STATUS,
-    INST_SYNC_READ,
-    INST_SYNC_WRITE,
-    MAX_ID,
-)
 
+from softfinger.daemon.errors import ServoError
+from softfinger.daemon.port_access import open_port
 from softfinger.daemon.servos.control_table import crc16
-from softfinger.daemon.servos.port import UNPACED_TIMEOUT, SerialPort
 
+with contextlib.suppress(ModuleNotFoundError):  # On Windows, only simulated servos are supported.
+    import termios
+
+BITS_PER_BYTE = 10
+# Reply timeout for setup and calibration, which run outside the loop [s]. A new servo has the
+# factory return delay, and the adapter or the machine may be slow.
+UNPACED_TIMEOUT = 0.5
 TRY_COUNT = 3  # number of attempts per exchange outside the tick
+_READ_SIZE = 4096
 _HEADER = b"\xff\xff\xfd"
 _PREFIX = _HEADER + b"\x00"
 _STUFFED = _HEADER + b"\xfd"
@@ -56,6 +57,107 @@ _OLD_HEADER = b"\xff\xff"  # Protocol 1.0: header, ID, length, instruction or er
 _OLD_STATUS = 6  # length of a ping reply in Protocol 1.0 [bytes]
 _OLD_TIMEOUT = 0.5  # timeout [s]; on a busy machine, an emulated servo may take longer than 0.1 s
 _ERROR_MASK = 0x7F  # mask of the error code in the error byte; the highest bit is the alert bit
+
+
+# --- port -----------------------------------------------------------------------------------------
+
+
+class PortLost(ServoError):
+    """The open port has disappeared because the adapter was unplugged or lost power."""
+
+
+class SerialPort(PortHandler):  # type: ignore[misc]
+    """An exclusive serial port for one thread.
+
+    The reply timeout is ``reply_timeout`` seconds, or more if the transmission takes longer.
+    ``received`` contains bytes that have not been decoded yet. ``deadline`` is the time at which
+    the current exchange times out [s, time.monotonic()].
+    """
+
+    def __init__(
+        self, path: str, baud: int, reply_timeout: float, low_latency: bool = True
+    ) -> None:
+        """Create a closed port. ``low_latency`` selects the low-latency mode of the adapter."""
+        super().__init__(path)
+        self._low_latency = low_latency
+        self.baudrate = baud
+        self.reply_timeout = reply_timeout
+        self.received = bytearray()
+        self.deadline = 0.0
+        self._descriptor = -1
+        self._sent = 0
+
+    def openPort(self) -> bool:
+        """Open the port exclusively. Raises ServoError with the reason and a fix."""
+        self.ser = open_port(self.port_name, self.baudrate, "servos.port", ServoError)
+        self._descriptor = self.ser.fileno()
+        try:
+            if self._low_latency:
+                self.ser.set_low_latency_mode(True)
+        except (OSError, ValueError, NotImplementedError, AttributeError):
+            pass  # Pseudo-terminals and some adapters lack low-latency mode.
+        self.received.clear()
+        self.ser.reset_input_buffer()
+        return True
+
+    def closePort(self) -> None:
+        """Close the port if it is open."""
+        if self.ser is not None:
+            self.ser.close()
+        self._descriptor = -1
+
+    def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
+        """Send a packet; return True if it was completely sent.
+
+        ``reply`` is the expected length of the reply. If a reply is expected, older input is
+        discarded before sending. The reply deadline is ``until`` [s, time.monotonic()] or earlier.
+        """
+        remaining = packet
+        try:
+            if reply:
+                self.received.clear()
+                termios.tcflush(self._descriptor, termios.TCIFLUSH)
+            while remaining:
+                remaining = remaining[os.write(self._descriptor, remaining) :]
+        except BlockingIOError:
+            return False
+        except (termios.error, OSError, ValueError) as error:
+            raise self._gone(error) from None
+        if reply:
+            self._sent = len(packet)
+            self.setPacketTimeout(reply)
+            if self.deadline > until:
+                self.deadline = until
+        return True
+
+    def setPacketTimeout(self, packet_length: int) -> None:
+        """Set the deadline for a reply of ``packet_length`` bytes."""
+        wire = (packet_length + self._sent) * BITS_PER_BYTE / self.baudrate
+        # At low baud rates, allow twice the transmission time plus the return delays.
+        self.deadline = time.monotonic() + max(self.reply_timeout, 2.0 * wire + 0.001)
+
+    def fill(self) -> bool:
+        """Wait for bytes and append them to ``received``; return False if the deadline passes."""
+        try:
+            remaining = max(0.0, self.deadline - time.monotonic())
+            if not select.select((self._descriptor,), (), (), remaining)[0]:
+                return False
+            data = os.read(self._descriptor, _READ_SIZE)
+        except (OSError, ValueError) as error:
+            raise self._gone(error) from None
+        if not data:
+            raise self._gone(OSError(errno.EIO, "hung up"))
+        self.received += data
+        return True
+
+    def _gone(self, error: object) -> PortLost:
+        return PortLost(
+            f"{self.port_name}: the port is lost ({error}): connect the adapter and switch on the "
+            "servo supply"
+        )
+
+
+# --- packets --------------------------------------------------------------------------------------
 
 
 def packed(packet_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -86,7 +188,7 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
         """Add byte stuffing and CRC to the packet ``txpacket`` and send it."""
         packet = packed(txpacket[4], txpacket[7], bytes(txpacket[8:-2]))
-        return int(COMM_SUCCESS if port.send(packet, _STATUS_SIZE) else COMM_TX_FAIL)
+        return int(sdk.COMM_SUCCESS if port.send(packet, _STATUS_SIZE) else sdk.COMM_TX_FAIL)
 
     def readTxRx(
         self, port: SerialPort, dxl_id: int, address: int, length: int
@@ -97,12 +199,12 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         an earlier action instruction and is skipped. The SDK does not wait for replies to action
         instructions.
         """
-        request = packed(dxl_id, INST_READ, struct.pack("<HH", address, length))
+        request = packed(dxl_id, sdk.INST_READ, struct.pack("<HH", address, length))
         if not port.send(request, _STATUS_SIZE + length):
-            return [], int(COMM_TX_FAIL), 0
+            return [], int(sdk.COMM_TX_FAIL), 0
         while True:
             packet, result = self.rxPacket(port, False)
-            if result != COMM_SUCCESS:
+            if result != sdk.COMM_SUCCESS:
                 return [], result, 0
             if packet[4] != dxl_id:
                 continue
@@ -126,8 +228,8 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                 del buffer[:skipped]
             if start >= 0 and len(buffer) >= 8:
                 sender, length = buffer[4], buffer[5] | buffer[6] << 8
-                known = sender == BROADCAST_ID if fast_option else sender <= MAX_ID
-                if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != INST_STATUS:
+                known = sender == sdk.BROADCAST_ID if fast_option else sender <= sdk.MAX_ID
+                if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != sdk.INST_STATUS:
                     self.skipped_bytes += 1
                     del buffer[0]  # Skip an echo of the request, or line noise.
                     continue
@@ -137,18 +239,18 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
             if not port.fill():
                 if buffer:
                     self.torn += 1
-                    return b"", int(COMM_RX_CORRUPT)
+                    return b"", int(sdk.COMM_RX_CORRUPT)
                 self.timeouts += 1
-                return b"", int(COMM_RX_TIMEOUT)
+                return b"", int(sdk.COMM_RX_TIMEOUT)
         packet = bytes(buffer[:end])
         del buffer[:end]
         if crc16(packet[:-2]) != packet[-2] | packet[-1] << 8:
             self.crc_errors += 1
-            return packet, int(COMM_RX_CORRUPT)
+            return packet, int(sdk.COMM_RX_CORRUPT)
         if not fast_option and _STUFFED in packet[7:-2]:
             body = packet[7:-2].replace(_STUFFED, _HEADER)
             packet = packet[:5] + struct.pack("<H", len(body) + 2) + body + packet[-2:]
-        return packet, int(COMM_SUCCESS)
+        return packet, int(sdk.COMM_SUCCESS)
 
 
 # --- the tick's exchanges ------------------------------------------------------------------------
@@ -162,46 +264,39 @@ class GroupRead:
     are undefined.
     """
 
-    instruction = INST_SYNC_READ
+    instruction = sdk.INST_SYNC_READ
 
-    def __init__(
-        self,
-        port: SerialPort,
-        handler: PacketHandler,
-        address: int,
-        length: int,
-        ids: Sequence[int],
-    ) -> None:
+    def __init__(self, line: ServoLine, address: int, length: int, ids: Sequence[int]) -> None:
         self.start = address
         self.data = dict.fromkeys(ids, b"")
         self.errors = dict.fromkeys(ids, 0)
-        self.port = port
-        self._handler = handler
+        self.port = line.port
+        self._handler = line.handler
         self._length = length
         span = struct.pack("<HH", address, length)
-        self._request = packed(BROADCAST_ID, self.instruction, span + bytes(ids))
+        self._request = packed(sdk.BROADCAST_ID, self.instruction, span + bytes(ids))
         self._reply = (_STATUS_SIZE + length) * len(ids)
 
     def exchange(self, until: float = math.inf) -> int:
         """Perform the read before ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
-            return int(COMM_TX_FAIL)
+            return int(sdk.COMM_TX_FAIL)
         handler = self._handler
         for servo_id in self.data:  # The servos reply in the order of `data`.
             while True:
                 packet, result = handler.rxPacket(self.port, False)
-                if result != COMM_SUCCESS:
+                if result != sdk.COMM_SUCCESS:
                     return result
                 if packet[8] & _ERROR_MASK:  # The data of an error reply are invalid.
                     handler.refused += 1
-                    return int(COMM_RX_CORRUPT)
+                    return int(sdk.COMM_RX_CORRUPT)
                 if len(packet) != _STATUS_SIZE + self._length:
                     handler.late += 1
                 elif packet[4] == servo_id:
                     break
             self.errors[servo_id] = packet[8]
             self.data[servo_id] = packet[9:-2]
-        return int(COMM_SUCCESS)
+        return int(sdk.COMM_SUCCESS)
 
 
 class FastGroupRead(GroupRead):
@@ -212,11 +307,11 @@ class FastGroupRead(GroupRead):
     def exchange(self, until: float = math.inf) -> int:
         """Perform the read before ``until`` [s, time.monotonic()]; return an SDK result code."""
         if not self.port.send(self._request, self._reply, until):
-            return int(COMM_TX_FAIL)
+            return int(sdk.COMM_TX_FAIL)
         handler, length = self._handler, self._length
         while True:
             packet, result = handler.rxPacket(self.port, True)
-            if result != COMM_SUCCESS:
+            if result != sdk.COMM_SUCCESS:
                 return result
             if len(packet) == 8 + len(self.data) * (length + 4):
                 break
@@ -224,14 +319,14 @@ class FastGroupRead(GroupRead):
         at = 8
         for servo_id in self.data:
             if packet[at + 1] != servo_id:
-                return int(COMM_RX_CORRUPT)
+                return int(sdk.COMM_RX_CORRUPT)
             if packet[at] & _ERROR_MASK:  # The data of an error reply are invalid.
                 handler.refused += 1
-                return int(COMM_RX_CORRUPT)
+                return int(sdk.COMM_RX_CORRUPT)
             self.errors[servo_id] = packet[at]
             self.data[servo_id] = packet[at + 2 : at + 2 + length]
             at += length + 4
-        return int(COMM_SUCCESS)
+        return int(sdk.COMM_SUCCESS)
 
 
 class GroupWrite:
@@ -245,7 +340,7 @@ class GroupWrite:
     def send(self, values: Sequence[bytes]) -> None:
         """Write one value per servo, in the order of the IDs. Servos do not reply."""
         body = b"".join(name + value for name, value in zip(self.ids, values, strict=True))
-        self._port.send(packed(BROADCAST_ID, INST_SYNC_WRITE, self._span + body))
+        self._port.send(packed(sdk.BROADCAST_ID, sdk.INST_SYNC_WRITE, self._span + body))
 
 
 # --- single servos, outside the tick -------------------------------------------------------------
@@ -262,14 +357,14 @@ class ServoLine:
         """Return the servo's model number, or None if it does not reply."""
         for _ in range(tries):
             number, result, _ = self.handler.ping(self.port, servo_id)
-            if result == COMM_SUCCESS:
+            if result == sdk.COMM_SUCCESS:
                 return int(number)
         return None
 
     def ping_old(self, servo_id: int) -> bool:
         """Return True if a servo replies to a Protocol 1.0 ping."""
         port = self.port
-        body = bytes((servo_id, 2, INST_PING))
+        body = bytes((servo_id, 2, sdk.INST_PING))
         request = _OLD_HEADER + body + bytes((~sum(body) & 0xFF,))
         port.send(request, _OLD_STATUS, time.monotonic() + _OLD_TIMEOUT)
         while True:
@@ -277,7 +372,7 @@ class ServoLine:
             reply = came[max(came.find(_OLD_HEADER), 0) :][:_OLD_STATUS]
             if len(reply) == _OLD_STATUS:
                 sound = ~sum(reply[2:-1]) & 0xFF == reply[-1]
-                return sound and reply[:2] == _OLD_HEADER and reply[2] != BROADCAST_ID
+                return sound and reply[:2] == _OLD_HEADER and reply[2] != sdk.BROADCAST_ID
             if not port.fill():
                 return False
 
@@ -289,11 +384,11 @@ class ServoLine:
         """
         found: dict[int, tuple[int, int]] = {}
         port = self.port
-        port.send(packed(BROADCAST_ID, INST_PING), _STATUS_SIZE)
+        port.send(packed(sdk.BROADCAST_ID, sdk.INST_PING), _STATUS_SIZE)
         port.deadline = time.monotonic() + wait
         while time.monotonic() < port.deadline:
             packet, result = self.handler.rxPacket(port, False)
-            if result == COMM_SUCCESS and len(packet) == _STATUS_SIZE + 3:
+            if result == sdk.COMM_SUCCESS and len(packet) == _STATUS_SIZE + 3:
                 found[packet[4]] = (packet[9] | packet[10] << 8, packet[11])
         return found
 
@@ -301,7 +396,7 @@ class ServoLine:
         """Read a register span; return None if there is no valid reply."""
         for _ in range(TRY_COUNT):
             data, result, error = self.handler.readTxRx(self.port, servo_id, address, length)
-            if result == COMM_SUCCESS:
+            if result == sdk.COMM_SUCCESS:
                 return None if error & _ERROR_MASK else bytes(data)
         return None
 

@@ -107,10 +107,7 @@ def search(
     Baud rates that the adapter does not support are skipped. If corrupted bytes arrive, each of the
     ``ids`` is probed individually.
 
-    Raises
-    ------
-    ServoError
-        If the port can't be opened at any of the rates.
+    Raises ServoError if the port can't be opened at any of the rates.
     """
     found: list[FoundServo] = []
     garbled: list[Garbled] = []
@@ -241,10 +238,7 @@ def provision(settings: Settings) -> list[Finding]:
     -------
     One finding for each change (status ``fixed``) and for each failure (status ``warn``).
 
-    Raises
-    ------
-    ServoError
-        If the port can't be opened.
+    Raises ServoError if the port can't be opened.
     """
     servos = settings.servos
     result: list[Finding] = []

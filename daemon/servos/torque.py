@@ -79,10 +79,7 @@ class Torque:
     def on(self) -> None:
         """Switch torque on at the current angle with zero motor current.
 
-        Raises
-        ------
-        ServoError
-            If torque could not be switched on or verified. Torque may be on.
+        Raises ServoError if torque could not be switched on or verified. Torque may be on.
         """
         self._not_after = time.monotonic() + _ON_TIMEOUTS * self._line.port.reply_timeout
         tables = self._read_ram()
@@ -211,10 +208,7 @@ class Torque:
 
         ``table`` contains the servo's registers from address ``start`` on.
 
-        Raises
-        ------
-        ServoError
-            If the bus watchdog has stopped the servo or is no longer armed.
+        Raises ServoError if the bus watchdog has stopped the servo or is no longer armed.
         """
         if self.goals is None:
             return True

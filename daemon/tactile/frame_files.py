@@ -86,10 +86,8 @@ def load_recording(
     noise : expected standard deviation of the noise of a cell [Pa]
     full_count : reading of saturated cells [counts]
 
-    Raises
-    ------
-    RecordingError
-        If the recording cannot be read. The message names the file and the problem.
+    Raises RecordingError if the recording cannot be read. The message names the file and the
+    problem.
     """
     notes: list[str] = []
     try:

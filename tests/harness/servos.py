@@ -15,7 +15,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from softfinger.daemon.servos.port import SerialPort
+from softfinger.daemon.servos.protocol import SerialPort
 from softfinger.daemon.simulation.servo_model import framing
 from softfinger.daemon.simulation.servo_model.framing import PacketParser, frame
 from softfinger.daemon.simulation.servo_model.servo import EmulatedServo

@@ -17,8 +17,7 @@ from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.exchange import ExchangeTimes, judge_exchanges
-from softfinger.daemon.servos.port import SerialPort
-from softfinger.daemon.servos.protocol import FastGroupRead
+from softfinger.daemon.servos.protocol import FastGroupRead, SerialPort
 from softfinger.daemon.simulation.emulator.folder import send_words
 from softfinger.daemon.types import Reading
 from tests.conftest import until

@@ -17,9 +17,10 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import checks, dynamixel
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Servos
+from softfinger.daemon.servos.checks import latency_file
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
-from softfinger.daemon.servos.port import SerialPort, latency_file
+from softfinger.daemon.servos.protocol import SerialPort
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import Goal, Reading

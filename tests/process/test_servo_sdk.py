@@ -9,8 +9,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.port import SerialPort
-from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler
+from softfinger.daemon.servos.protocol import (
+    FastGroupRead,
+    GroupRead,
+    PacketHandler,
+    SerialPort,
+    ServoLine,
+)
 from tests.harness.servos import RunningBus
 
 OK = sdk.COMM_SUCCESS
@@ -36,7 +41,7 @@ def test_arbitrary_bytes_are_transferred_unchanged(bus, line, data, kind):
     assert handler.writeTxRx(port, 1, start, len(data), list(data)) == (OK, 0)
     assert bus.memory(0)[start : start + len(data)] == data
     assert handler.readTxRx(port, 1, start, len(data)) == (list(data), OK, 0)
-    group = kind(port, handler, start, len(data), [1])
+    group = kind(ServoLine(port, handler), start, len(data), [1])
     assert group.exchange() == OK
     assert group.data[1] == data
 
@@ -91,11 +96,11 @@ def test_the_unmodified_sdk_works(bus):
 def test_error_bytes_of_a_group_read_are_kept(bus, line):
     bus.fault("overload=1")
     for kind in (GroupRead, FastGroupRead):
-        group = kind(*line, reg.PRESENT_POSITION, 4, [1, 2])
+        group = kind(ServoLine(*line), reg.PRESENT_POSITION, 4, [1, 2])
         assert group.exchange() == OK
         assert group.errors == {1: 0x80, 2: 0}
         # The addresses are beyond the end of the control table.
-        assert kind(*line, 660, 4, [1, 2]).exchange() != OK
+        assert kind(ServoLine(*line), 660, 4, [1, 2]).exchange() != OK
 
 
 def test_noise_before_a_reply_is_skipped_and_counted():

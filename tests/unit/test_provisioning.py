@@ -12,8 +12,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos import provisioning
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.servos.port import UNPACED_TIMEOUT, PortLost
-from softfinger.daemon.servos.protocol import PacketHandler, ServoLine
+from softfinger.daemon.servos.protocol import UNPACED_TIMEOUT, PacketHandler, PortLost, ServoLine
 from softfinger.daemon.servos.provisioning import (
     Found,
     FoundServo,

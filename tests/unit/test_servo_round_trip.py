@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softfinger.daemon.servos import control_table as reg
-from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler
+from softfinger.daemon.servos.protocol import FastGroupRead, GroupRead, PacketHandler, ServoLine
 from softfinger.daemon.simulation.servo_model.servo_bus import ServoBus
 from tests.harness.servos import RADIAN, DirectPort, make_bus
 
@@ -98,7 +98,7 @@ def test_any_instruction_equals_direct_access(steps, angles):
                 got = {each: bytes(bulk.data_dict[each][0]) for each in servos}
             else:
                 make = FastGroupRead if "fast" in kind else GroupRead
-                group_read = make(port, handler, address, what, list(servos))
+                group_read = make(ServoLine(port, handler), address, what, list(servos))
                 result = group_read.exchange()
                 got = group_read.data
             if None not in expect.values():
