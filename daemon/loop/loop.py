@@ -30,20 +30,6 @@ from softfinger.daemon.wire.command_server import Handler
 from softfinger.daemon.wire.loop_link import Link
 from softfinger.daemon.wire.publisher import Publisher
 
-# Maximum age of commands that switch torque on or move the hand [s]. A higher limit applies to
-# ``hold`` during a grip.
-_START_AGE_MAX = 0.2
-
-
-def command_age_max(settings: Settings, waits: bool) -> float:
-    """Return the maximum age [s] of a command that switches torque on or moves the hand.
-
-    An older command may have been sent before the servo watchdog stopped the hand. If ``waits`` is
-    True, the servos' clock and watchdog pause while this machine is late.
-    """
-    watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
-    return min(_START_AGE_MAX, watchdog or _START_AGE_MAX)
-
 
 class Commands(Protocol):
     """Command source: `wire.command_server.CommandServer` or a recording."""
@@ -92,7 +78,7 @@ class Loop:
             self.torque,
             perception,
             self.emit,
-            command_age_max(settings, clock.pauses_when_late),
+            clock.pauses_when_late,
         )
         self._after_opening: Breach | None = None  # fault that is latched once the hand is open
         self.statistics = Statistics()

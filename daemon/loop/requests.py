@@ -29,6 +29,9 @@ from softfinger.daemon.safety.torque_state import TorqueState
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS, EventSink, State
 
 AGE_MAX = 1.0  # maximum age of all commands except status and stop [s]
+# Maximum age of commands that switch torque on or move the hand [s]. A higher limit applies to
+# ``hold`` during a grip.
+_START_AGE_MAX = 0.2
 _COMPLIANCE_RANGE = (0.01, 1.0)  # rad/(N·m)
 _ENVELOPE_KEYS = frozenset({"command", "client"})
 _MODE_REMEDIES = {Mode.DISARMED: "arm first", Mode.FAULT: "clear the fault first"}
@@ -100,6 +103,16 @@ def _out_of_range(key: str, value: float, low: float, high: float) -> str:
     return f"found {value:g} rad/(N·m), expected {low:g} to {high:g}"
 
 
+def command_age_max(settings: Settings, waits: bool) -> float:
+    """Return the maximum age [s] of a command that switches torque on or moves the hand.
+
+    An older command may have been sent before the servo watchdog stopped the hand. If ``waits`` is
+    True, the servos' clock and watchdog pause while this machine is late.
+    """
+    watchdog = 0.0 if settings.simulated or waits else settings.servos.watchdog
+    return min(_START_AGE_MAX, watchdog or _START_AGE_MAX)
+
+
 class Lease:
     """Exclusive control of the hand by one client.
 
@@ -152,14 +165,10 @@ class Requests:
         torque: TorqueState,
         perception: Perception,
         emit: EventSink,
-        command_age_max: float,
+        waits: bool,
     ) -> None:
-        """Create the executor.
-
-        ``command_age_max`` is the maximum age [s] of a command that switches torque on or moves
-        the hand.
-        """
-        self._command_age_max = command_age_max
+        """Create the executor; see `command_age_max` for ``waits``."""
+        self._command_age_max = command_age_max(settings, waits)
         self._settings = settings
         self._state = state
         self._control = control

@@ -114,13 +114,7 @@ def check_servo(
 ) -> list[Finding]:
     """Return the problems of a servo that replies, in order of severity.
 
-    Parameters
-    ----------
-    name : name of the servo in reports
-    model : model named in the settings
-    table : registers of the servo
-    settings : required configuration
-    finger : 0 left, 1 right
+    ``name`` is the servo's name in reports, and ``model`` is the model in the settings.
     """
     if not table:
         why = (
@@ -131,12 +125,14 @@ def check_servo(
     number = table.word(reg.MODEL_NUMBER)
     if number != model.number:
         return [Finding("FAIL", name, *other_model(number, model))]
-    found = [
-        *_check_registers(name, model, table, settings, finger),
-        *_check_state(name, model, table, settings),
-        *_notice_servo(name, model, table, settings),
-        *notice_strength(name, model, settings),
-    ]
+    found = []
+    for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
+        if (wrong := row.wrong_in(table)) is not None:
+            fix = f"{FIX}, then {row.then}" if row.then else "" if row.status == "note" else FIX
+            found.append(Finding(row.status, name, row.told(wrong), fix))
+    found += _check_state(name, model, table, settings)
+    found += _notice_servo(name, model, table, settings)
+    found += notice_strength(name, model, settings)
     severity: tuple[Status, ...] = ("FAIL", "warn", "note")
     return sorted(found, key=lambda each: severity.index(each.status))
 
@@ -145,22 +141,10 @@ def other_model(number: int, model: ServoModel) -> tuple[str, str]:
     """Return the problem and the fix for a servo whose model differs from the settings."""
     if number in (each.number for each in reg.MODELS.values()):
         return f"is an {reg.name_of(number)}, expected an {model.name}", "set servos.model"
-    known = ", ".join(reg.MODELS)
     return (
         f"has unknown model number {number}, expected {model.number} ({model.name})",
-        f"use one of the known models: {known}",
+        f"use one of the known models: {', '.join(reg.MODELS)}",
     )
-
-
-def _check_registers(
-    name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
-) -> Iterator[Finding]:
-    """Yield a finding for each register that contains a wrong value."""
-    for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
-        wrong = row.wrong_in(table)
-        if wrong is not None:
-            fix = f"{FIX}, then {row.then}" if row.then else "" if row.status == "note" else FIX
-            yield Finding(row.status, name, row.told(wrong), fix)
 
 
 def _check_state(

@@ -333,42 +333,28 @@ class DynamixelServos:
     # --- closing ---------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, int]:
-        handler = self._handler
-        return {
-            "timeouts": handler.timeouts,
-            "crc": handler.crc_errors,
-            "torn": handler.torn,
-            "retries": self._retries,
-            "skipped_bytes": handler.skipped_bytes,
-            "late": handler.late,
-            "refused": handler.refused,
-            "alerts": self._alerts,
-        }
+        return {**self._handler.counters, "retries": self._retries, "alerts": self._alerts}
 
     def close(self) -> None:
         """Switch torque off, verify the result if possible, and close the port. Never raises.
 
         If another program switched torque on, the torque stays on.
         """
-        torque, reading = self._torque, Reading()
+        torque, reading, why = self._torque, Reading(), ""
         try:
             for _ in range(_CLOSING_TRY_COUNT):
                 if torque is None or not torque.may_be_on:
                     break
                 self.torque_off(reading)
-            if torque is not None and torque.may_be_on:
-                _log.error(
-                    "servos: torque off was not confirmed; the bus watchdogs will stop the servos"
-                )
-        except PortLost:
-            _log.error(
-                "servos: the port was lost while torque was on; the bus watchdogs will stop "
-                "the servos"
-            )
         except Exception as error:
-            _log.error("servos: torque off was not confirmed: %s", error)
+            why = f" ({error})"
         if torque is not None:
             self._torque_may_be_on = torque.may_be_on
+        if torque is not None and torque.may_be_on:
+            _log.error(
+                "servos: torque off was not confirmed%s; the bus watchdogs will stop the servos",
+                why,
+            )
         port, self._port = self._port, None
         self._torque = self._reads = None
         if port is not None:

@@ -173,17 +173,15 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     """The SDK's packet handler with corrections and error counters."""
 
     def __init__(self) -> None:
-        self.timeouts = 0  # missing replies
-        self.crc_errors = 0  # replies with an invalid CRC
-        self.torn = 0  # incomplete replies
-        self.late = 0  # number of replies to an earlier request
-        self.refused = 0  # number of reads to which a servo replied with an error
-        self.skipped_bytes = 0  # number of bytes outside any reply
+        # Missing replies, replies with a wrong CRC, incomplete replies, bytes outside any reply,
+        # replies to an earlier request, and reads to which a servo replied with an error.
+        names = ("timeouts", "crc", "torn", "skipped_bytes", "late", "refused")
+        self.counters = dict.fromkeys(names, 0)
 
     @property
     def damaged(self) -> int:
         """Sum of the counters for corrupted replies, incomplete replies and unexpected bytes."""
-        return self.crc_errors + self.torn + self.skipped_bytes
+        return sum(self.counters[name] for name in ("crc", "torn", "skipped_bytes"))
 
     def txPacket(self, port: SerialPort, txpacket: list[int]) -> int:
         """Add byte stuffing and CRC to the packet ``txpacket`` and send it."""
@@ -224,13 +222,13 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
             start = buffer.find(_PREFIX)
             skipped = start if start >= 0 else max(len(buffer) - 3, 0)
             if skipped:
-                self.skipped_bytes += skipped
+                self.counters["skipped_bytes"] += skipped
                 del buffer[:skipped]
             if start >= 0 and len(buffer) >= 8:
                 sender, length = buffer[4], buffer[5] | buffer[6] << 8
                 known = sender == sdk.BROADCAST_ID if fast_option else sender <= sdk.MAX_ID
                 if not known or not 4 <= length <= _MAX_PACKET - 7 or buffer[7] != sdk.INST_STATUS:
-                    self.skipped_bytes += 1
+                    self.counters["skipped_bytes"] += 1
                     del buffer[0]  # Skip an echo of the request, or line noise.
                     continue
                 end = 7 + length
@@ -238,14 +236,14 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
                     break
             if not port.fill():
                 if buffer:
-                    self.torn += 1
+                    self.counters["torn"] += 1
                     return b"", int(sdk.COMM_RX_CORRUPT)
-                self.timeouts += 1
+                self.counters["timeouts"] += 1
                 return b"", int(sdk.COMM_RX_TIMEOUT)
         packet = bytes(buffer[:end])
         del buffer[:end]
         if crc16(packet[:-2]) != packet[-2] | packet[-1] << 8:
-            self.crc_errors += 1
+            self.counters["crc"] += 1
             return packet, int(sdk.COMM_RX_CORRUPT)
         if not fast_option and _STUFFED in packet[7:-2]:
             body = packet[7:-2].replace(_STUFFED, _HEADER)
@@ -288,10 +286,10 @@ class GroupRead:
                 if result != sdk.COMM_SUCCESS:
                     return result
                 if packet[8] & _ERROR_MASK:  # The data of an error reply are invalid.
-                    handler.refused += 1
+                    handler.counters["refused"] += 1
                     return int(sdk.COMM_RX_CORRUPT)
                 if len(packet) != _STATUS_SIZE + self._length:
-                    handler.late += 1
+                    handler.counters["late"] += 1
                 elif packet[4] == servo_id:
                     break
             self.errors[servo_id] = packet[8]
@@ -315,13 +313,13 @@ class FastGroupRead(GroupRead):
                 return result
             if len(packet) == 8 + len(self.data) * (length + 4):
                 break
-            handler.late += 1
+            handler.counters["late"] += 1
         at = 8
         for servo_id in self.data:
             if packet[at + 1] != servo_id:
                 return int(sdk.COMM_RX_CORRUPT)
             if packet[at] & _ERROR_MASK:  # The data of an error reply are invalid.
-                handler.refused += 1
+                handler.counters["refused"] += 1
                 return int(sdk.COMM_RX_CORRUPT)
             self.errors[servo_id] = packet[at]
             self.data[servo_id] = packet[at + 2 : at + 2 + length]

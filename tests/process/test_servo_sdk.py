@@ -117,8 +117,8 @@ def test_noise_before_a_reply_is_skipped_and_counted():
     for noise in (b"\x00\xff", b"\xff\xff\xfd", echo, b"\xff\xff\xfd\x00\x01\xff\xff\x55"):
         handler = PacketHandler()
         assert handler.rxPacket(Script(noise + status), False) == (status, OK)
-        assert handler.skipped_bytes == len(noise)
+        assert handler.counters["skipped_bytes"] == len(noise)
     handler = PacketHandler()
     assert handler.rxPacket(Script(status[:-3]), False)[1] == sdk.COMM_RX_CORRUPT
     assert handler.rxPacket(Script(b""), False)[1] == sdk.COMM_RX_TIMEOUT
-    assert (handler.torn, handler.timeouts) == (1, 1)
+    assert (handler.counters["torn"], handler.counters["timeouts"]) == (1, 1)

@@ -21,8 +21,7 @@ from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.endpoints import bind
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.loop import build
-from softfinger.daemon.loop.loop import command_age_max
-from softfinger.daemon.loop.requests import Command, Lease, parse
+from softfinger.daemon.loop.requests import Command, Lease, command_age_max, parse
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire.command_server import Handler, decode
 from tests.conftest import until
