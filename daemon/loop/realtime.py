@@ -202,17 +202,12 @@ class RealTime:
         """Prevent deep processor idle states while the device file is open."""
         try:
             descriptor = os.open(_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
+            self._undo.callback(os.close, descriptor)
+            os.write(descriptor, bytes(4))
         except OSError as error:
             text = f"{_LATENCY_DEVICE} denied ({error.strerror}): deep idle states delay wake-ups"
             self._refused(text, "" if isinstance(error, FileNotFoundError) else GRANT_LATENCY)
-            return
-        try:
-            os.write(descriptor, bytes(4))
-        except OSError as error:
-            os.close(descriptor)
-            self._refused(f"{_LATENCY_DEVICE} denied ({error.strerror})")
         else:
-            self._undo.callback(os.close, descriptor)
             self.granted.append("deep idle states disabled")
 
     def _sharpen_timer(self, nanoseconds: int) -> None:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.own_files import open_regular, read_file, unpacked_size_max
+from softfinger.daemon.profile.settings import TactileSettings
 from softfinger.daemon.tactile import tekscan
 
 FloatArray = NDArray[np.float64]
@@ -69,22 +70,10 @@ class FrameRecording:
     notes: tuple[str, ...] = ()
 
 
-def load_recording(
-    path: Path,
-    pascal_per_count: float,
-    rate: float,
-    noise: float = 0.0,
-    full_count: int = _COUNT_MAX,
-) -> FrameRecording:
-    """Read a recording.
+def load_recording(path: Path, settings: TactileSettings) -> FrameRecording:
+    """Read a recording from a file or a folder.
 
-    Parameters
-    ----------
-    path : file or folder
-    pascal_per_count : pressure of one count [Pa]
-    rate : frame rate [Hz] of a recording without times
-    noise : expected standard deviation of the noise of a cell [Pa]
-    full_count : reading of saturated cells [counts]
+    The frame rate in the settings applies to a recording without times.
 
     Raises RecordingError if the recording cannot be read. The message names the file and the
     problem.
@@ -92,14 +81,14 @@ def load_recording(
     notes: list[str] = []
     try:
         if path.is_dir():
-            found = _checked(_folder(path), pascal_per_count, rate, noise, notes)
+            found = _checked(_folder(path), settings, notes)
         elif path.suffix == ".npz":
-            found = _checked(_archive(path, notes), pascal_per_count, rate, noise, notes)
+            found = _checked(_archive(path, notes), settings, notes)
         elif path.suffix == ".npy":
-            found = _checked({"frames": _frames(path)}, pascal_per_count, rate, noise, notes)
+            found = _checked({"frames": _frames(path)}, settings, notes)
         else:
-            found = _export(path, pascal_per_count, rate, noise, notes)
-        if found.full_count is None and (clipped := _clipped(found, pascal_per_count, full_count)):
+            found = _export(path, settings, notes)
+        if found.full_count is None and (clipped := _clipped(found, settings)):
             notes.append(clipped)
         return replace(found, notes=tuple(notes))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
@@ -221,20 +210,20 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
-def _export(
-    path: Path, scale: float, rate: float, noise: float, notes: list[str]
-) -> FrameRecording:
-    export = tekscan.parse(tekscan.decode(read_file(path)), 1.0 / rate)
-    scale = 1.0 if export.raw else scale
-    found = _checked({"frames": export.values}, scale, rate, noise, notes)
+def _export(path: Path, settings: TactileSettings, notes: list[str]) -> FrameRecording:
+    export = tekscan.parse(tekscan.decode(read_file(path)), 1.0 / settings.rate)
+    if export.raw:  # Count in units of one.
+        noise = settings.noise / settings.pascal_per_count
+        settings = settings.model_copy(update={"pascal_per_count": 1.0, "noise": noise})
+    found = _checked({"frames": export.values}, settings, notes)
     full_count = None
     if math.isfinite(export.full):
-        full_count = max(min(int(export.full / scale), _COUNT_MAX), 1)
+        full_count = max(min(int(export.full / settings.pascal_per_count), _COUNT_MAX), 1)
     return replace(found, t=export.t, pitch=export.pitch, full_count=full_count, whole=export.raw)
 
 
 def _checked(
-    arrays: dict[str, NDArray[Any]], scale: float, rate: float, noise: float, notes: list[str]
+    arrays: dict[str, NDArray[Any]], settings: TactileSettings, notes: list[str]
 ) -> FrameRecording:
     frames = arrays["frames"]
     if frames.ndim != 3 or frames.size == 0:
@@ -249,9 +238,9 @@ def _checked(
         if not live.any():
             raise ValueError("live: found only False, expected True for each cell of the sensor")
     whole = frames.dtype.kind != "f"
-    scale = 1.0 if whole else scale
+    scale = 1.0 if whole else settings.pascal_per_count
     frames, live = _without_dead(frames, live, _COUNT_MAX * scale)
-    _check_below(frames, live, noise / scale if whole else noise, notes)
+    _check_below(frames, live, settings.noise * scale / settings.pascal_per_count, notes)
     largest = float(frames[:, live].max())
     if largest > _COUNT_MAX * scale:
         expected = f"at most {_COUNT_MAX} counts"
@@ -259,9 +248,9 @@ def _checked(
             expected += f", set tactile.pascal_per_count to {largest / _COUNT_MAX:.3g} or more"
         raise _out_of_range(frames, frames.argmax(), expected)
     count = len(frames)
-    t = np.arange(count) / rate
+    t = np.arange(count) / settings.rate
     if "t" in arrays:
-        t = _seconds(_row(arrays, "t", count), rate, notes)
+        t = _seconds(_row(arrays, "t", count), settings.rate, notes)
     truths = {name: _row(arrays, name, count).astype(np.float64) for name in TRUTHS & arrays.keys()}
     counts = np.maximum(frames if whole else np.round(frames / scale), 0).astype(np.uint16)
     return FrameRecording(counts, t, live, truths, largest, whole)
@@ -384,19 +373,19 @@ def _factor(t: NDArray[Any], step: float, rate: float) -> float:
     return min((1.0, *_UNITS)[whole:], key=lambda factor: abs(math.log(step * factor * rate)))
 
 
-def _clipped(found: FrameRecording, scale: float, full: int) -> str:
+def _clipped(found: FrameRecording, settings: TactileSettings) -> str:
     """Return a warning if several cells share the maximum reading, which indicates saturation."""
     counts = np.where(found.live, found.counts, 0)
     top = int(counts.max())
     at_top = counts == top
     cells = np.count_nonzero(at_top.any(axis=0))
-    if top == 0 or top >= full or cells < _CLIPPED_COUNT_MIN:
+    if top == 0 or top >= settings.full_count or cells < _CLIPPED_COUNT_MIN:
         return ""
     # Rounding alone makes the next lower reading about as frequent as the maximum reading.
     below = int(counts[~at_top].max(initial=0))
     if below and np.count_nonzero(at_top) <= 2 * np.count_nonzero(counts == below):
         return ""
-    unit = "counts" if found.whole else f"counts of {scale:g} Pa"
+    unit = "counts" if found.whole else f"counts of {settings.pascal_per_count:g} Pa"
     return (
         f"{cells} cells have the same maximum reading, {top} {unit}: if these cells are "
         f"saturated, set tactile.full_count = {top}, because d would be overestimated otherwise"

@@ -87,13 +87,7 @@ class ReplayTactile:
         if not path:
             raise TactileError(f"tactile.recording: found no file for the {FINGERS[finger]} finger")
         try:
-            recording = load_recording(
-                Path(path),
-                settings.pascal_per_count,
-                settings.rate,
-                settings.noise,
-                settings.full_count,
-            )
+            recording = load_recording(Path(path), settings)
         except RecordingError as error:
             raise TactileError(str(error)) from None
         if recording.counts.shape[1:] != (settings.rows, settings.cols):

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.clock import Clock, RealClock, VirtualClock
 from softfinger.daemon.errors import TactileError
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.simulation.emulator.tactile_board import ENCODERS, TactileBoard
 from softfinger.daemon.simulation.faults import parse_faults
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.daemon.tactile.base import TactileSensor, make_sensor
+from softfinger.daemon.tactile.frame_files import FrameRecording, load_recording
 from softfinger.daemon.types import Frame
 from tests.conftest import until
 
@@ -26,6 +27,23 @@ ROWS = COLS = 32
 BACKENDS = ("simulated", "flexitac", "glove", "cobs", "replay")
 SERIAL = ("flexitac", "glove", "cobs")
 RATE = 200.0  # Hz
+
+
+def read_frames(
+    path: Path,
+    pascal_per_count: float,
+    rate: float,
+    noise: float = 0.0,
+    full_count: int = 65535,
+) -> FrameRecording:
+    """Read a recording with these tactile settings."""
+    changes = {
+        "pascal_per_count": pascal_per_count,
+        "rate": rate,
+        "noise": noise,
+        "full_count": full_count,
+    }
+    return load_recording(path, TactileSettings().model_copy(update=changes))
 
 
 def image(number: int) -> NDArray[np.uint16]:

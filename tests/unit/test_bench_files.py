@@ -17,10 +17,10 @@ from softfinger.daemon.perception.finger_model import make_models
 from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.profile.validation import plausibility_warnings
-from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.replay import ReplayTactile
 from softfinger.tools.analysis.analyse import analyse, open_source
 from softfinger.tools.recordings.record import RecordingWriter
+from tests.harness.tactile import read_frames
 
 PITCH, SCALE, NOISE = 0.058 / 44, 4.0, 300.0
 TIP, MATERIAL = Fingertip(0.020), Material.table_i()
@@ -99,7 +99,7 @@ def test_cells_above_the_saturation_pressure_of_the_header_are_excluded(
     if digits == 0:  # Rounding to whole kPa adds noise of 0.3 kPa.
         settings, within = SETTINGS.changed(tactile={"noise": 600.0}), 6e-5
     check(path, settings, within)
-    assert not load_recording(path, SCALE, 100.0).notes
+    assert not read_frames(path, SCALE, 100.0).notes
 
 
 def test_a_replayed_export_uses_its_own_saturation(press, tmp_path):
@@ -123,19 +123,17 @@ def test_cells_at_the_maximum_reading_are_reported_if_the_header_has_no_saturati
     assert f"set tactile.full_count = {round(full / SCALE)}" in done.stderr
     np.save(tmp_path / "b.npy", np.round(frames / 400.0).astype(np.uint8))
     full_count = round(full / 400.0)
-    assert (
-        "have the same maximum reading" in load_recording(tmp_path / "b.npy", 400.0, 100.0).notes[0]
-    )
-    assert not load_recording(tmp_path / "b.npy", 400.0, 100.0, full_count=full_count).notes
+    assert "have the same maximum reading" in read_frames(tmp_path / "b.npy", 400.0, 100.0).notes[0]
+    assert not read_frames(tmp_path / "b.npy", 400.0, 100.0, full_count=full_count).notes
 
 
 @pytest.mark.parametrize("step", [4.0, 300.0, 3000.0])
 def test_round_readings_do_not_count_as_saturated(press, tmp_path, step):
     np.save(tmp_path / "a.npy", np.round(press / step).astype(np.uint16))
-    assert not load_recording(tmp_path / "a.npy", step, 100.0).notes
+    assert not read_frames(tmp_path / "a.npy", step, 100.0).notes
     upright = SensorGrid(44, 44, PITCH).pressure(TIP, MATERIAL, 0.004)
     np.save(tmp_path / "b.npy", upright)  # The four middle cells have the same reading.
-    assert not load_recording(tmp_path / "b.npy", SCALE, 100.0).notes
+    assert not read_frames(tmp_path / "b.npy", SCALE, 100.0).notes
 
 
 def test_raw_readings_saturate_at_255(press, tmp_path):
@@ -143,7 +141,7 @@ def test_raw_readings_saturate_at_255(press, tmp_path):
     counts = np.minimum(np.round(press / 60.0), 255)
     assert np.count_nonzero(counts == 255) > 20
     path.write_bytes(export(counts, "RAW", 1.0, digits=0))
-    assert load_recording(path, 60.0, 100.0).full_count == 255
+    assert read_frames(path, 60.0, 100.0).full_count == 255
     check(path, SETTINGS.changed(tactile={"pascal_per_count": 60.0}))
 
 
@@ -154,14 +152,14 @@ def test_raw_readings_saturate_at_255(press, tmp_path):
 def test_negative_noise_of_a_tared_sensor_is_clipped_and_reported(tared, tmp_path, kind):
     frames = tared if np.dtype(kind).kind == "f" else np.round(tared / SCALE)
     np.savez(tmp_path / "a.npz", frames=frames.astype(kind))
-    (note,) = load_recording(tmp_path / "a.npz", SCALE, 100.0).notes
+    (note,) = read_frames(tmp_path / "a.npz", SCALE, 100.0).notes
     assert "of the readings are below 0, down to -" in note
     check(tmp_path / "a.npz")
 
 
 def test_a_tared_export_gives_equally_accurate_contacts(tared, tmp_path):
     (tmp_path / "a.asf").write_bytes(export(tared))
-    assert "below 0" in load_recording(tmp_path / "a.asf", SCALE, 100.0).notes[0]
+    assert "below 0" in read_frames(tmp_path / "a.asf", SCALE, 100.0).notes[0]
     check(tmp_path / "a.asf")
 
 
@@ -171,7 +169,7 @@ def test_a_nan_reading_is_reported_with_its_position(press, tmp_path, value):
     frames[4, 10, 12] = value
     np.save(tmp_path / "a.npy", frames)
     with pytest.raises(RecordingError, match="outside") as caught:
-        load_recording(tmp_path / "a.npy", SCALE, 100.0, 1520.0)
+        read_frames(tmp_path / "a.npy", SCALE, 100.0, 1520.0)
     place = "frame 5 of 8, row 11, cell 13 (frames[4, 10, 12])"
     assert f"{place} is {value:.10g}" in str(caught.value)
 
@@ -183,20 +181,20 @@ def test_a_negative_zero_offset_is_not_treated_as_noise(tared, tmp_path):
         match=r"half of the readings are -1\.\d+e\+03 or less: "
         "tare",
     ):
-        load_recording(tmp_path / "a.npy", SCALE, 100.0, NOISE)
+        read_frames(tmp_path / "a.npy", SCALE, 100.0, NOISE)
 
 
 def test_pressure_beyond_the_count_range_is_reported_with_the_setting(press, tmp_path):
     np.save(tmp_path / "a.npy", press * 12.0)
     with pytest.raises(RecordingError, match=r"set tactile\.pascal_per_count to \d.* or more"):
-        load_recording(tmp_path / "a.npy", SCALE, 100.0)
+        read_frames(tmp_path / "a.npy", SCALE, 100.0)
 
 
 def test_a_cell_that_is_nan_in_all_frames_is_dead(press, tmp_path):
     frames = press.copy()
     frames[:, 20:22, 25] = np.nan
     np.save(tmp_path / "a.npy", frames)
-    assert np.argwhere(~load_recording(tmp_path / "a.npy", SCALE, 100.0).live).tolist() == [
+    assert np.argwhere(~read_frames(tmp_path / "a.npy", SCALE, 100.0).live).tolist() == [
         [20, 25],
         [21, 25],
     ]
@@ -239,7 +237,7 @@ def test_all_locales_give_the_same_readings(press, tmp_path, form):
     frames = press[[1, 4, 5]]
     (tmp_path / "a.asf").write_bytes(export(frames, **form))
     (tmp_path / "b.asf").write_bytes(export(frames))
-    read, plain = (load_recording(tmp_path / name, SCALE, 100.0) for name in ("a.asf", "b.asf"))
+    read, plain = (read_frames(tmp_path / name, SCALE, 100.0) for name in ("a.asf", "b.asf"))
     assert np.array_equal(read.counts, plain.counts)
     assert read.t.tolist() == plain.t.tolist() == [0.0, 0.01, 0.02]
     assert read.pitch == plain.pitch == pytest.approx((PITCH, PITCH), rel=1e-5)
@@ -251,7 +249,7 @@ def test_commas_as_separator_and_decimal_sign_are_reported_if_ambiguous(tmp_path
     with pytest.raises(
         RecordingError, match="line 8: found 4 cells, expected 3: the comma is both the separator"
     ):
-        load_recording(tmp_path / "a.asf", SCALE, 100.0)
+        read_frames(tmp_path / "a.asf", SCALE, 100.0)
 
 
 UNITS = {
@@ -268,7 +266,7 @@ def test_units_of_pressure_and_of_force_per_cell(press, tmp_path, unit, encoding
     path = tmp_path / "a.asf"
     frames = press[:6]
     path.write_bytes(export(frames, unit, 1.0 / UNITS[unit], digits=9, encoding=encoding))
-    pressures = load_recording(path, SCALE, 100.0).counts * SCALE
+    pressures = read_frames(path, SCALE, 100.0).counts * SCALE
     assert pressures == pytest.approx(frames, rel=1e-4, abs=SCALE)
 
 
@@ -276,7 +274,7 @@ def test_units_of_pressure_and_of_force_per_cell(press, tmp_path, unit, encoding
 def test_an_unknown_unit_is_reported(press, tmp_path, unit):
     (tmp_path / "a.asf").write_bytes(export(press[:1], unit))
     with pytest.raises(RecordingError, match=f"UNITS: found '{unit}', expected RAW or a unit"):
-        load_recording(tmp_path / "a.asf", SCALE, 100.0)
+        read_frames(tmp_path / "a.asf", SCALE, 100.0)
 
 
 def test_other_files_are_refused_with_the_supported_types(tmp_path):
@@ -284,7 +282,7 @@ def test_other_files_are_refused_with_the_supported_types(tmp_path):
     with pytest.raises(
         RecordingError, match=r"expected a Tekscan-style export, or an \.npz or \.npy"
     ):
-        load_recording(tmp_path / "a.csv", SCALE, 100.0)
+        read_frames(tmp_path / "a.csv", SCALE, 100.0)
 
 
 # Times
@@ -301,7 +299,7 @@ def test_times_in_other_units_are_converted_and_reported_once(
 ):
     t = ((STEPS + start) * factor).astype(kind)
     np.savez(tmp_path / "a.npz", frames=press, t=t)
-    read = load_recording(tmp_path / "a.npz", SCALE, rate)
+    read = read_frames(tmp_path / "a.npz", SCALE, rate)
     assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
     (note,) = read.notes
     assert note.startswith(f"t: interpreted as {name}, which gives 0.01 s between frames")
@@ -310,7 +308,7 @@ def test_times_in_other_units_are_converted_and_reported_once(
 @pytest.mark.parametrize(("name", "factor"), [("µs", 1000), ("ns", 1_000_000)])
 def test_times_since_a_boot_half_an_hour_ago_are_not_dates(press, tmp_path, name, factor):
     np.savez(tmp_path / "a.npz", frames=press, t=(STEPS + 2_000_000) * factor)
-    read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    read = read_frames(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t == pytest.approx(STEPS * 1e-3)
     assert read.notes[0].startswith(f"t: interpreted as {name}, ")
 
@@ -319,7 +317,7 @@ def test_times_since_a_boot_half_an_hour_ago_are_not_dates(press, tmp_path, name
 @pytest.mark.parametrize("start", [0.0, 3600.0, 1.7e9])
 def test_times_in_seconds_are_not_changed(press, tmp_path, start, key):
     np.savez(tmp_path / "a.npz", frames=press, **{key: STEPS * 1e-3 + start})
-    read = load_recording(tmp_path / "a.npz", SCALE, 25.0)
+    read = read_frames(tmp_path / "a.npz", SCALE, 25.0)
     assert read.t == pytest.approx(STEPS * 1e-3, abs=1e-6)
     assert not read.notes
 
@@ -328,13 +326,13 @@ def test_numpy_times_keep_their_unit(press, tmp_path):
     for k, unit in enumerate(("ms", "us", "ns")):
         t = np.datetime64("2024-05-01") + STEPS.astype("m8[ms]").astype(f"m8[{unit}]")
         np.savez(tmp_path / f"{k}.npz", frames=press, t=t)
-        assert load_recording(tmp_path / f"{k}.npz", SCALE, 25.0).t == pytest.approx(STEPS * 1e-3)
+        assert read_frames(tmp_path / f"{k}.npz", SCALE, 25.0).t == pytest.approx(STEPS * 1e-3)
 
 
 @pytest.mark.parametrize(("start", "step"), [(0.0, 0.5), (1_700_000_000, 60)])
 def test_a_slow_recording_is_read_unchanged_and_reported(press, tmp_path, start, step):
     np.savez(tmp_path / "a.npz", frames=press, t=start + np.arange(8) * step)
-    read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    read = read_frames(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t.tolist() == (np.arange(8) * step).tolist()
     assert read.notes == (
         f"t: interpreted as seconds, which gives {step} s between frames, but tactile.rate "
@@ -348,14 +346,14 @@ def test_frame_numbers_are_not_used_as_times(press, tmp_path, t):
     with pytest.raises(
         RecordingError, match="t: found frame numbers that increase by 1, expected times"
     ):
-        load_recording(tmp_path / "a.npz", SCALE, 100.0)
-    assert load_recording(tmp_path / "a.npz", SCALE, 1.0).t.tolist() == list(range(8))
+        read_frames(tmp_path / "a.npz", SCALE, 100.0)
+    assert read_frames(tmp_path / "a.npz", SCALE, 1.0).t.tolist() == list(range(8))
 
 
 def test_times_as_texts_are_reported(press, tmp_path):
     np.savez(tmp_path / "a.npz", frames=press, t=(STEPS * 1e-3).astype(str))
     with pytest.raises(RecordingError, match=r"t: found <U\d+ of shape \(8,\), expected 8 numbers"):
-        load_recording(tmp_path / "a.npz", SCALE, 25.0)
+        read_frames(tmp_path / "a.npz", SCALE, 25.0)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +366,7 @@ def test_times_as_texts_are_reported(press, tmp_path):
 def test_times_that_do_not_increase_are_reported_with_their_position(press, tmp_path, t, told):
     np.savez(tmp_path / "a.npz", frames=press, t=t)
     with pytest.raises(RecordingError, match=told):
-        load_recording(tmp_path / "a.npz", SCALE, 100.0)
+        read_frames(tmp_path / "a.npz", SCALE, 100.0)
 
 
 # Readings with another scale
@@ -426,7 +424,7 @@ def test_frames_with_contact_cause_no_message(press, tmp_path, inline):
 def test_the_only_stack_of_an_archive_is_used_and_reported(press, tmp_path, name):
     held = {name: press, "time": STEPS * 1e-3, "serial": np.array("A1"), "zero": press[0]}
     np.savez(tmp_path / "a.npz", **held)
-    read = load_recording(tmp_path / "a.npz", SCALE, 100.0)
+    read = read_frames(tmp_path / "a.npz", SCALE, 100.0)
     assert read.t == pytest.approx(STEPS * 1e-3)
     assert read.notes == (
         f"the file does not contain an array 'frames'; using {name!r}, the only three-dimensional "
@@ -440,11 +438,11 @@ def test_the_contents_of_an_archive_without_frames_are_listed(press, tmp_path):
     with pytest.raises(
         RecordingError, match=r"found left \(8, 44, 44\), right .*, note \(\), expected"
     ):
-        load_recording(tmp_path / "a.npz", SCALE, 100.0)
+        read_frames(tmp_path / "a.npz", SCALE, 100.0)
     many = {f"a{k}": np.zeros(k + 1) for k in range(30)}
     np.savez(tmp_path / "b.npz", **many)
     with pytest.raises(RecordingError, match=r"a7 \(8,\), …, expected an array 'frames'"):
-        load_recording(tmp_path / "b.npz", SCALE, 100.0)
+        read_frames(tmp_path / "b.npz", SCALE, 100.0)
 
 
 # Cells with another pitch

@@ -6,8 +6,8 @@ import pytest
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.profile.settings import TactileSettings
-from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.replay import ReplayTactile
+from tests.harness.tactile import read_frames
 
 FRAMES = np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6)
 
@@ -68,11 +68,11 @@ def test_without_repetition_the_replay_ends_with_an_invalid_frame(tmp_path):
 def test_a_folder_of_frames_is_read_in_numerical_order(tmp_path):
     for k in range(5):
         np.save(tmp_path / f"frame{k * 3}.npy", FRAMES[k])  # frame12 must follow frame9.
-    recording = load_recording(tmp_path, 1.0, 50.0)
+    recording = read_frames(tmp_path, 1.0, 50.0)
     assert np.array_equal(recording.counts, FRAMES)
     assert recording.t.tolist() == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
     np.save(tmp_path / "t.npy", np.array([1.0, 2, 3, 5, 8]))
-    assert load_recording(tmp_path, 1.0, 50.0).t.tolist() == [0, 1, 2, 4, 7]
+    assert read_frames(tmp_path, 1.0, 50.0).t.tolist() == [0, 1, 2, 4, 7]
 
 
 def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
@@ -80,7 +80,7 @@ def test_cells_and_true_contacts_of_an_archive_are_read(tmp_path):
     live[1, 2] = False
     d = np.linspace(0, 0.008, 5)
     np.savez_compressed(tmp_path / "run.npz", frames=FRAMES, t=np.arange(5) * 0.1, live=live, d=d)
-    read = load_recording(tmp_path / "run.npz", 1.0, 1.0)
+    read = read_frames(tmp_path / "run.npz", 1.0, 1.0)
     assert np.array_equal(read.counts, FRAMES)
     assert np.array_equal(read.live, live)
     assert np.array_equal(read.truths["d"], d)
@@ -114,16 +114,16 @@ def test_invalid_recordings_are_reported(tmp_path, held, told):
     path = tmp_path / "run.npz"
     np.savez(path, **held)
     with pytest.raises(RecordingError, match=told):
-        load_recording(path, 0.001, 100.0)
+        read_frames(path, 0.001, 100.0)
 
 
 def test_unreadable_files_are_reported(tmp_path):
     with pytest.raises(RecordingError, match="No such file"):
-        load_recording(tmp_path / "none.npz", 1.0, 1.0)
+        read_frames(tmp_path / "none.npz", 1.0, 1.0)
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no zip")
     with pytest.raises(RecordingError, match=r"bad\.npz"):
-        load_recording(tmp_path / "bad.npz", 1.0, 1.0)
+        read_frames(tmp_path / "bad.npz", 1.0, 1.0)
     with pytest.raises(RecordingError, match=r"does not contain an \.npy file"):
-        load_recording(tmp_path, 1.0, 1.0)
+        read_frames(tmp_path, 1.0, 1.0)
     with pytest.raises(TactileError, match="found no file for the left finger"):
         replay("", VirtualClock())

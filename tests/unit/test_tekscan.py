@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.errors import RecordingError
-from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.daemon.tactile.tekscan import TekscanError, parse
+from tests.harness.tactile import read_frames
 
 EXPORT = """\
 DATA_TYPE MOVIE
@@ -115,18 +115,18 @@ def test_files_that_are_not_exports_are_reported(old, new, told):
 def test_an_export_is_read_as_a_recording(tmp_path):
     path = tmp_path / "run.asf"
     path.write_text(EXPORT)
-    recording = load_recording(path, 4.0, 100.0)
+    recording = read_frames(path, 4.0, 100.0)
     assert recording.counts.dtype == np.uint16
     assert recording.counts[0, 1].tolist() == [7, 255, 1]
     assert not recording.live[0, 2]
     path.write_text(EXPORT.replace("RAW", "kPa"))
-    assert load_recording(path, 50.0, 100.0).counts[0, 1].tolist() == [140, 5100, 20]
+    assert read_frames(path, 50.0, 100.0).counts[0, 1].tolist() == [140, 5100, 20]
     for value in ("nan", "-255"):
         path.write_text(EXPORT.replace("7,255,1", f"7,{value},1"))
         with pytest.raises(RecordingError, match=f"row 2, cell 2 .* is {value}, expected"):
-            load_recording(path, 4.0, 100.0)
+            read_frames(path, 4.0, 100.0)
     path.write_text("nothing")
     with pytest.raises(
         RecordingError, match=r"run\.asf: the file does not contain an ASCII_DATA line"
     ):
-        load_recording(path, 4.0, 100.0)
+        read_frames(path, 4.0, 100.0)

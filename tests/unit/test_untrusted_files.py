@@ -21,10 +21,10 @@ from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerEr
 from softfinger.daemon.perception.calibration_file import load_calibration
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.tactile.frame_files import load_recording
 from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.record import recover
+from tests.harness.tactile import read_frames
 
 ROOM = 200e6  # number of bytes by which the address space may grow
 
@@ -47,7 +47,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "profile": load,
     "map": envelope,
     "calibration": load_calibration,
-    "frames": lambda path: load_recording(path, 1.0, 100.0),
+    "frames": lambda path: read_frames(path, 1.0, 100.0),
 }
 
 
@@ -146,7 +146,7 @@ def test_frames_beyond_the_end_of_the_file_are_reported(tmp_path, name, make):
         match=r"the file contains less data|suspiciously large|unsupported compression|"
         r"an ASCII_DATA line|expected 4",
     ):
-        load_recording(tmp_path / name, 1.0, 100.0)
+        read_frames(tmp_path / name, 1.0, 100.0)
 
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -219,9 +219,7 @@ def _stream(path: Path, settings: Settings, own: bool) -> Source:
 
 def _frames_alone(path: Path, settings: Settings, own: bool) -> Source:
     tactile = settings.tactile
-    recording = load_recording(
-        path, tactile.pascal_per_count, tactile.rate, tactile.noise, tactile.full_count
-    )
+    recording = load_recording(path, tactile)
     if own:
         raise SettingsError(
             f"{path}: the file does not contain settings: describe the tip and the sensor with "

@@ -74,9 +74,7 @@ def _read(path: Path, tactile: TactileSettings, sensor: Sensor) -> FrameRecordin
 
     Raises RecordingError if the recording has other cells than the sensor.
     """
-    found = load_recording(
-        path, tactile.pascal_per_count, tactile.rate, tactile.noise, tactile.full_count
-    )
+    found = load_recording(path, tactile)
     for note in found.notes:
         to_stderr("calibrate")(f"{path}: {note}")
     if found.counts.shape[1:] != (sensor.rows, sensor.cols):
