@@ -68,10 +68,10 @@ def check_servos(settings: Settings) -> list[Finding]:
             _wait_for(line, settings)
             found = examine(line, settings, model)
             exchange = _try_exchange(line, settings, model, found)
-            silent = [each.id for each in found if not each.replies]
+            silent = [each.joint.id for each in found if not each.replies]
             late = [servo_id for servo_id in silent if line.ping(servo_id) is not None]
         results = [
-            line for each in found for line in _judge(each, settings, model, each.id in late)
+            line for each in found for line in _judge(each, settings, model, each.joint.id in late)
         ]
         results += exchange
         if len(late) < len(silent):
@@ -102,7 +102,7 @@ def _try_exchange(
     """
     if not all(each.table and not each.errors for each in found):
         return []
-    ids = [each.id for each in found]
+    ids = [each.joint.id for each in found]
     firmwares = [each.table[reg.FIRMWARE_VERSION] for each in found]
     try:
         reads, results = choose_reads(line, ids, all(map(model.fast_read, firmwares)))
@@ -128,7 +128,7 @@ def _try_exchange(
 
 def _judge(servo: Examined, settings: Settings, model: ServoModel, late: bool) -> list[Finding]:
     """Return one servo's findings; ``late`` is True if the servo replied after the timeout."""
-    name = servo.name
+    name = servo.joint.name
     if not servo.replies:
         waited = settings.servos.open_timeout
         problem = (

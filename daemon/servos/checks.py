@@ -15,10 +15,9 @@ from softfinger.daemon.profile.settings import GeometrySettings, Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding, Status
 from softfinger.daemon.servos.control_table import ServoModel
-from softfinger.daemon.servos.joint import JointScale, servo_name
+from softfinger.daemon.servos.joint import Joint
 from softfinger.daemon.servos.protocol import ServoLine
 from softfinger.daemon.servos.register_table import required_registers
-from softfinger.daemon.types import FINGERS
 
 CHECKED = reg.BACKUP_READY  # number of registers to read (addresses 0 to 146)
 DRIVE_REVERSE = 0b0001
@@ -63,9 +62,7 @@ class Registers(bytes):
 class Examined:
     """Result of checking one servo."""
 
-    finger: int
-    id: int
-    name: str  # in reports
+    joint: Joint
     table: Registers
     findings: list[Finding]  # problems in order of severity
     misplaced: Finding | None = None  # finding that reports an implausible joint angle, or None
@@ -84,19 +81,18 @@ class Examined:
 def examine(line: ServoLine, settings: Settings, model: ServoModel) -> list[Examined]:
     """Ping, read and check each servo in the order of ``scene.fingers``."""
     found = []
-    for finger in map(FINGERS.index, settings.scene.fingers):
-        servo_id = settings.servos.ids[finger]
-        name, table, misplaced = servo_name(servo_id, finger), Registers(), None
+    for finger in settings.scene.indices:
+        joint = Joint.of(settings.servos, finger, model)
+        table, misplaced = Registers(), None
         findings: list[Finding] = []
-        if line.ping(servo_id) is not None:
-            table = Registers.read(line, servo_id)
-            findings = check_servo(name, model, table, settings, finger)
-        elif line.ping_old(servo_id):
-            findings = [Finding("FAIL", name, *OLD_PROTOCOL)]
+        if line.ping(joint.id) is not None:
+            table = Registers.read(line, joint.id)
+            findings = check_servo(joint, model, table, settings)
+        elif line.ping_old(joint.id):
+            findings = [Finding("FAIL", joint.name, *OLD_PROTOCOL)]
         if table:
-            scale = JointScale.of(settings.servos, finger, model)
-            misplaced = check_position(name, scale, table, settings.hand, finger)
-        found.append(Examined(finger, servo_id, name, table, findings, misplaced))
+            misplaced = check_position(joint, table, settings.hand)
+        found.append(Examined(joint, table, findings, misplaced))
     return found
 
 
@@ -110,12 +106,13 @@ def check_model(name: str, model: ServoModel, mode: int) -> Finding | None:
 
 
 def check_servo(
-    name: str, model: ServoModel, table: Registers, settings: Settings, finger: int
+    joint: Joint, model: ServoModel, table: Registers, settings: Settings
 ) -> list[Finding]:
     """Return the problems of a servo that replies, in order of severity.
 
-    ``name`` is the servo's name in reports, and ``model`` is the model in the settings.
+    ``model`` is the model in the settings.
     """
+    name = joint.name
     if not table:
         why = (
             "replies to a ping but not to a read: the status return level is 0, two servos have "
@@ -126,7 +123,7 @@ def check_servo(
     if number != model.number:
         return [Finding("FAIL", name, *other_model(number, model))]
     found = []
-    for row in required_registers(model, settings, finger, table[reg.FIRMWARE_VERSION]):
+    for row in required_registers(model, settings, joint.finger, table[reg.FIRMWARE_VERSION]):
         if (wrong := row.wrong_in(table)) is not None:
             fix = f"{FIX}, then {row.then}" if row.then else "" if row.status == "note" else FIX
             found.append(Finding(row.status, name, row.told(wrong), fix))
@@ -248,12 +245,7 @@ def notice_strength(name: str, model: ServoModel, settings: Settings) -> list[Fi
 
 
 def check_angle(
-    name: str,
-    scale: JointScale,
-    counts: int,
-    hand: GeometrySettings,
-    finger: int,
-    is_reversed: bool = False,
+    joint: Joint, counts: int, hand: GeometrySettings, is_reversed: bool = False
 ) -> Finding | None:
     """Return a finding if a joint is far outside the hand's limits, otherwise None.
 
@@ -261,7 +253,8 @@ def check_angle(
     resets the servo's turn count and thus corrects a lost turn. If ``is_reversed``, the servo
     counts down from 0 even after a reboot, so a reboot does not help.
     """
-    low, high = hand.q_min[finger], hand.q_max[finger]
+    low, high = hand.q_min[joint.finger], hand.q_max[joint.finger]
+    name, scale = joint.name, joint.scale
 
     def is_inside(position: int) -> bool:
         return low - ANGLE_MARGIN <= scale.angle(position) <= high + ANGLE_MARGIN
@@ -286,14 +279,12 @@ def check_angle(
     return Finding("FAIL", name, problem, cure)
 
 
-def check_position(
-    name: str, scale: JointScale, table: Registers, hand: GeometrySettings, finger: int
-) -> Finding | None:
+def check_position(joint: Joint, table: Registers, hand: GeometrySettings) -> Finding | None:
     """Check the joint angle in the registers of a servo."""
     counts = table.long(reg.PRESENT_POSITION)
     counts_down = bool(table[reg.DRIVE_MODE] & DRIVE_REVERSE)
     is_reversed = counts_down and -reg.COUNTS_PER_TURN < counts <= 0
-    return check_angle(name, scale, counts, hand, finger, is_reversed)
+    return check_angle(joint, counts, hand, is_reversed)
 
 
 def latency_file(path: str, sysfs: Path = _SYSFS) -> Path | None:

@@ -40,7 +40,7 @@ from softfinger.daemon.servos.exchange import (
     choose_reads,
     note_slow_replies,
 )
-from softfinger.daemon.servos.joint import Joint, JointScale, pack_goal
+from softfinger.daemon.servos.joint import Joint, pack_goal
 from softfinger.daemon.servos.protocol import (
     BITS_PER_BYTE,
     GroupRead,
@@ -50,7 +50,7 @@ from softfinger.daemon.servos.protocol import (
     ServoLine,
 )
 from softfinger.daemon.servos.torque import Torque
-from softfinger.daemon.types import FINGERS, Goal, Reading
+from softfinger.daemon.types import Goal, Reading
 
 _log = logging.getLogger(__name__)
 
@@ -117,10 +117,9 @@ class DynamixelServos:
         servos, profile = self._settings, self._profile
         model = by_name(servos.model)
         stored = max(2, round(_RECENT_TIME * profile.loop.rate))
-        self._joints = [
-            Joint(f, servos.ids[f], JointScale.of(servos, f, model), sent=deque(maxlen=stored))
-            for f in map(FINGERS.index, profile.scene.fingers)
-        ]
+        self._joints = [Joint.of(servos, f, model) for f in profile.scene.indices]
+        for joint in self._joints:
+            joint.sent = deque(maxlen=stored)
         if self._port is None:
             patience = _BUSY_TIME if self._clock.pauses_when_late else 0.0
             port = SerialPort(servos.port, servos.baud, max(servos.reply_timeout, patience))
@@ -170,10 +169,10 @@ class DynamixelServos:
         ``allowed`` is the maximum reply time [s]. Raises ServoError, which lists all problems.
         """
         if not any(each.replies for each in found):
+            ids = ", ".join(str(joint.id) for joint in self._joints)
             raise ServosSilent(
-                f"{port.port_name}: no servo replies at {port.baudrate} baud (IDs "
-                f"{', '.join(str(each.id) for each in found)}): check the power supply and the "
-                "wiring; `softfinger doctor` tries every baud rate"
+                f"{port.port_name}: no servo replies at {port.baudrate} baud (IDs {ids}): check "
+                "the power supply and the wiring; `softfinger doctor` tries every baud rate"
             )
         slow = check_latency_timer(port.port_name, allowed)
         findings = [slow] if slow else []
@@ -182,7 +181,7 @@ class DynamixelServos:
             if not each.replies:
                 problem = f"no reply at {port.baudrate} baud"
                 fix = "check the cable and the ID; `softfinger doctor` tries every baud rate"
-                findings.append(Finding("FAIL", each.name, problem, fix))
+                findings.append(Finding("FAIL", each.joint.name, problem, fix))
         if errors := [each for each in findings if each.status == "FAIL"]:
             silent = sum(not each.replies for each in found)
             kind = ServosSilent if len(errors) == silent else ServoError

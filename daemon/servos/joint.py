@@ -114,6 +114,11 @@ class Joint:
     ticks: int = -1  # value of the servo clock at the last check
     ticked: float = math.inf  # time when the servo clock last advanced [s]
 
+    @classmethod
+    def of(cls, servos: ServoSettings, finger: int, model: ServoModel) -> Joint:
+        """Return the joint of finger 0 (left) or 1 (right) from the settings."""
+        return cls(finger, servos.ids[finger], JointScale.of(servos, finger, model))
+
     @property
     def name(self) -> str:
         """Servo name for reports."""

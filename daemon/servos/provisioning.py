@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_TIMEOUT
 
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.profile.settings import Settings
+from softfinger.daemon.profile.settings import GeometrySettings, Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import (
@@ -28,7 +28,7 @@ from softfinger.daemon.servos.checks import (
     other_model,
 )
 from softfinger.daemon.servos.control_table import ServoModel, by_name
-from softfinger.daemon.servos.joint import JointScale, servo_name
+from softfinger.daemon.servos.joint import Joint, servo_name
 from softfinger.daemon.servos.protocol import ServoLine, open_line
 from softfinger.daemon.servos.register_table import required_registers
 from softfinger.daemon.types import FINGERS
@@ -318,8 +318,8 @@ def _identify(path: str, change: Change, model: ServoModel) -> list[Finding]:
 
 def _set_up(line: ServoLine, settings: Settings, finger: int, model: ServoModel) -> list[Finding]:
     """Write all registers required by `register_table`, and reboot the servo if needed."""
-    servo_id = settings.servos.ids[finger]
-    name = servo_name(servo_id, finger)
+    joint = Joint.of(settings.servos, finger, model)
+    servo_id, name = joint.id, joint.name
     found: list[Finding] = []
 
     def failed(problem: str) -> list[Finding]:
@@ -354,34 +354,31 @@ def _set_up(line: ServoLine, settings: Settings, finger: int, model: ServoModel)
             found.append(Finding("warn", name, f"{what} {wrong} could not be set to {value}"))
         else:
             found.append(Finding("fixed", name, f"{what} {wrong} → {value}", row.then))
-    rebooted = _reboot_if_needed(line, settings, finger, model)
+    rebooted = _reboot_if_needed(line, joint, settings.hand)
     return [*found, rebooted] if rebooted else found
 
 
-def _reboot_if_needed(
-    line: ServoLine, settings: Settings, finger: int, model: ServoModel
-) -> Finding | None:
+def _reboot_if_needed(line: ServoLine, joint: Joint, hand: GeometrySettings) -> Finding | None:
     """Reboot a servo that has a hardware error or has lost a turn, and check it again.
 
     The caller must correct the servo's limits before the reboot.
     """
-    servo_id = settings.servos.ids[finger]
-    name, scale = servo_name(servo_id, finger), JointScale.of(settings.servos, finger, model)
+    name = joint.name
 
     def reason(table: Registers) -> str:
         if error := table[reg.HARDWARE_ERROR_STATUS]:
             return f"hardware error: {reg.hardware_error_names(error)}"
-        misplaced = check_position(name, scale, table, settings.hand, finger)
+        misplaced = check_position(joint, table, hand)
         if misplaced is None or misplaced.fix != LOST_TURN_FIX:
             return ""
         return f"position wrong by at least one turn: {table.long(reg.PRESENT_POSITION)} counts"
 
-    table = Registers.read(line, servo_id)
+    table = Registers.read(line, joint.id)
     if not table:
         return Finding("warn", name, "the registers could not be read")
     if not (why := reason(table)):
         return None
-    table = _reboot(line, servo_id)
+    table = _reboot(line, joint.id)
     if not table:
         return Finding("warn", name, f"no reply after a reboot ({why})")
     if still := reason(table):

@@ -11,7 +11,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.checks import check_model
 from softfinger.daemon.servos.control_table import by_name
-from softfinger.daemon.servos.joint import Joint, JointScale
+from softfinger.daemon.servos.joint import Joint
 from softfinger.daemon.types import Goal, Reading
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ class SimulatedServos:
         self._clock = clock
         self._joints = []
         for i in settings.scene.indices:
-            scale = JointScale.of(settings.servos, i, self._model)
-            bound = scale.bound_counts(settings.servos.current_limit[i])
-            self._joints.append(Joint(i, settings.servos.ids[i], scale, bound=bound))
+            joint = Joint.of(settings.servos, i, self._model)
+            joint.bound = joint.scale.bound_counts(settings.servos.current_limit[i])
+            self._joints.append(joint)
         self._watchdog = settings.servos.watchdog or math.inf
         self._connected = False
         self._torque = False

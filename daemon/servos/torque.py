@@ -126,8 +126,7 @@ class Torque:
         while True:
             positions = self._positions()
             strayed = [
-                check_angle(joint.name, joint.scale, positions[i], self._hand, joint.finger)
-                for i, joint in self._joints.items()
+                check_angle(joint, positions[i], self._hand) for i, joint in self._joints.items()
             ]
             if self._mode == reg.POSITION_MODE:  # The servo refuses goals outside its limits.
                 for i, joint in self._joints.items():
