@@ -62,7 +62,7 @@ class Publishing:
         self._scene = parts(settings)
         self._numbers = [0, 0]  # number of published frames per finger
         self._published = [-1, -1]  # `Frame.seq` // n of the last published frame, per finger
-        self._states = self._maps = 0  # numbers of published messages
+        self._states = 0  # number of published states
         # Time [s] and counts when the rates were last calculated.
         self._counted: tuple[float, ...] = (0.0,) * 6
 
@@ -97,7 +97,6 @@ class Publishing:
             return
         self._published[perception.finger] = frame.seq // n
         self._numbers[perception.finger] += 1
-        self._maps += 1
         wall = state.wall - (state.t - frame.t_sample)
         data = perception.published()
         number = self._numbers[perception.finger]
@@ -110,6 +109,7 @@ class Publishing:
         for perception in self._perceptions:
             frames[perception.finger] = perception.frame_count
         t = state.t + state.timing.behind_s
-        last, self._counted = self._counted, (t, state.seq, *frames, self._states, self._maps)
+        counted = t, state.seq, *frames, self._states, sum(self._numbers)
+        last, self._counted = self._counted, counted
         dt, *counts = (now - before for now, before in zip(self._counted, last, strict=True))
         return Rates(*(count / dt if dt > 0.0 else 0.0 for count in counts))

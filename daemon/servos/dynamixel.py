@@ -126,7 +126,7 @@ class DynamixelServos:
             port.openPort()
             self._port = port
         line = ServoLine(self._port, self._handler)
-        self._torque = torque = Torque(line, model, servos, profile.hand, self._joints)
+        self._torque = torque = Torque(line, model, profile, self._joints)
         torque.may_be_on = self._torque_may_be_on
         try:
             if torque.may_be_on:

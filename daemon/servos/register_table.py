@@ -100,7 +100,7 @@ class Requirement(NamedTuple):
     register: Register
     accepted: Container[int]
     value: int  # correct value
-    problem: Callable[[int], str]  # describes a wrong value and the expected value
+    told: Callable[[int], str]  # function that describes a wrong value and the expected value
     status: Status = "FAIL"
     then: str = ""  # action required after the value is corrected
     mask: int = -1
@@ -117,29 +117,27 @@ class Requirement(NamedTuple):
         """Return the correct value of a register that contains ``wrong``."""
         return wrong & ~self.mask | self.value
 
-    def told(self, wrong: int) -> str:
-        """Describe a wrong value and the expected value."""
-        return f"{self.register.name} {self.problem(wrong)}"
-
 
 def _exactly(address: int, value: int, why: str, status: Status = "FAIL") -> Requirement:
+    register = _AT[address]
     return Requirement(
-        _AT[address],
+        register,
         (value,),
         value,
-        lambda found: f"is {found}, expected {value}: {why}",
+        lambda found: f"{register.name} is {found}, expected {value}: {why}",
         status,
     )
 
 
 def _within(address: int, low: int, high: int, unit: str) -> Requirement:
     """Require a shutdown limit between ``low`` and the factory value ``high``."""
+    register = _AT[address]
     expected = f"{low}" if low == high else f"{low} to {high}"
     return Requirement(
-        _AT[address],
+        register,
         range(low, high + 1),
         high,
-        lambda found: f"is {found} {unit}, expected {expected} {unit}",
+        lambda found: f"{register.name} is {found} {unit}, expected {expected} {unit}",
         "warn",
     )
 
@@ -158,14 +156,17 @@ def required_registers(
             _AT[reg.RETURN_DELAY_TIME],
             range(RETURN_DELAY_MAX + 1),
             0,
-            lambda found: f"is {2 * found} µs, expected at most {2 * RETURN_DELAY_MAX} µs",
+            lambda found: (
+                f"return delay is {2 * found} µs, expected at most {2 * RETURN_DELAY_MAX} µs"
+            ),
         ),
         Requirement(
             _AT[reg.DRIVE_MODE],
             (0,),
             0,
             lambda found: (
-                f"{found} switches torque on with any goal, or makes the servo follow another servo"
+                f"drive mode {found} switches torque on with any goal, or makes the servo follow "
+                "another servo"
             ),
             mask=DRIVE_UNFIT,
         ),
@@ -174,7 +175,7 @@ def required_registers(
             set(range(256)) - set(servos.ids),
             255,
             lambda found: (
-                f"is {found}: the servo also executes commands for the servo with this ID"
+                f"shadow ID is {found}: the servo also executes commands for the servo with this ID"
             ),
         ),
         Requirement(
@@ -182,7 +183,7 @@ def required_registers(
             (0,),
             0,
             lambda found: (
-                f"is {found} counts, expected 0: it shifts this joint's zero by "
+                f"homing offset is {found} counts, expected 0: it shifts this joint's zero by "
                 f"{math.degrees(abs(found) * scale.radian):.1f}°"
             ),
             then="run `softfinger calibrate joints`, unless servos.zero was determined without "
@@ -197,8 +198,8 @@ def required_registers(
             range(slow, _NO_LIMIT),
             model.velocity_limit,
             lambda found: (
-                f"is {found * scale.velocity:.2g} rad/s at the joint, expected at least "
-                f"{slow * scale.velocity:.2g} rad/s"
+                f"velocity limit is {found * scale.velocity:.2g} rad/s at the joint, expected at "
+                f"least {slow * scale.velocity:.2g} rad/s"
             ),
             "warn",
         ),
@@ -207,8 +208,8 @@ def required_registers(
             (model.shutdown,),
             model.shutdown,
             lambda found: (
-                f"is {found}, expected {model.shutdown}: the servo does not switch torque off "
-                f"after {reg.hardware_error_names(model.shutdown & ~found)}"
+                f"shutdown is {found}, expected {model.shutdown}: the servo does not switch "
+                f"torque off after {reg.hardware_error_names(model.shutdown & ~found)}"
             ),
             "warn",
             mask=model.shutdown,
@@ -222,7 +223,8 @@ def required_registers(
                 (mode,),
                 mode,
                 lambda found: (
-                    f"is {told.get(found, str(found))} ({found}), expected {told[mode]} ({mode})"
+                    f"operating mode is {told.get(found, str(found))} ({found}), expected "
+                    f"{told[mode]} ({mode})"
                 ),
             )
         )
@@ -237,8 +239,8 @@ def required_registers(
                 range(needed, _NO_LIMIT),
                 needed,
                 lambda found: (
-                    f"is {found * unit:.3f} A, expected at least safety.current_max = "
-                    f"{safety.current_max:g} A"
+                    f"current limit is {found * unit:.3f} A, expected at least "
+                    f"safety.current_max = {safety.current_max:g} A"
                 ),
             )
         )
@@ -281,11 +283,17 @@ def _position_limits(scale: JointScale, settings: Settings, finger: int) -> list
             ", which exceeds one turn: run `softfinger calibrate joints` to determine zero and "
             "range"
         )
-    limits = (
-        (reg.MIN_POSITION_LIMIT, range(first + 1), 0),
-        (reg.MAX_POSITION_LIMIT, range(last, _NO_LIMIT), _POSITION_MAX),
-    )
     return [
-        Requirement(_AT[address], accepted, value, lambda found: f"is {found}, {needed}")
-        for address, accepted, value in limits
+        Requirement(
+            _AT[reg.MIN_POSITION_LIMIT],
+            range(first + 1),
+            0,
+            lambda found: f"min position limit is {found}, {needed}",
+        ),
+        Requirement(
+            _AT[reg.MAX_POSITION_LIMIT],
+            range(last, _NO_LIMIT),
+            _POSITION_MAX,
+            lambda found: f"max position limit is {found}, {needed}",
+        ),
     ]

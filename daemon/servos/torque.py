@@ -13,7 +13,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from softfinger.daemon.errors import ServoError
-from softfinger.daemon.profile.settings import GeometrySettings, ServoSettings
+from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos import control_table as reg
 from softfinger.daemon.servos.base import Finding
 from softfinger.daemon.servos.checks import REBOOT_FIX, check_angle
@@ -51,21 +51,16 @@ class Torque:
     """
 
     def __init__(
-        self,
-        line: ServoLine,
-        model: ServoModel,
-        servos: ServoSettings,
-        hand: GeometrySettings,
-        joints: Sequence[Joint],
+        self, line: ServoLine, model: ServoModel, settings: Settings, joints: Sequence[Joint]
     ) -> None:
         self.goals: GroupWrite | None = None
         self.may_be_on = False
         self._line = line
         self._model = model
-        self._hand = hand
+        self._hand = settings.hand
         self._joints = {joint.id: joint for joint in joints}
-        self._mode = reg.MODE_NUMBERS[servos.mode]
-        ticks = math.ceil(servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
+        self._mode = reg.MODE_NUMBERS[settings.servos.mode]
+        ticks = math.ceil(settings.servos.watchdog / reg.WATCHDOG_UNIT - 1e-9)
         self._ticks = min(ticks, reg.WATCHDOG_MAX)
         self._not_after = math.inf  # deadline for switching torque on [s, time.monotonic()]
         ids = list(self._joints)
