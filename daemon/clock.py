@@ -18,16 +18,12 @@ class Clock(Protocol):
     """Time source of the pipeline; all times are in seconds."""
 
     pauses_when_late: bool  # True if the hand's clock pauses while this machine is late
-    behind: float  # total time by which `now` lags behind the machine's clock [s]
 
     def now(self) -> float:
         """Return the monotonic time [s]."""
 
     def wall(self) -> float:
         """Return the Unix time [s] that corresponds to `now`."""
-
-    def host(self) -> float:
-        """Return the machine's monotonic time [s] for measuring computation times and delays."""
 
     def sleep_until(self, t: float) -> float:
         """Sleep until monotonic time ``t`` and return the wake-up delay [s].
@@ -36,7 +32,16 @@ class Clock(Protocol):
         """
 
 
-def make_clock(settings: Settings) -> Clock:
+class LoopClock(Clock, Protocol):
+    """Clock that drives the loop and also provides the machine's real time."""
+
+    behind: float  # total time by which `now` lags behind the machine's clock [s]
+
+    def host(self) -> float:
+        """Return the machine's monotonic time [s] for measuring computation times and delays."""
+
+
+def make_clock(settings: Settings) -> LoopClock:
     """Return the clock selected by ``loop.clock``."""
     name = settings.loop.clock
     if name == "auto":
@@ -131,7 +136,7 @@ class HandClock:
 
     pauses_when_late = True
 
-    def __init__(self, machine: Clock, due: Deadline | None = None) -> None:
+    def __init__(self, machine: LoopClock, due: Deadline | None = None) -> None:
         self._machine = machine
         self.wall = machine.wall
         self.host = machine.host

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from softfinger import __version__
 from softfinger.daemon.backends import backend, needs_hand
-from softfinger.daemon.clock import Clock, make_clock
+from softfinger.daemon.clock import LoopClock, make_clock
 from softfinger.daemon.errors import ServosSilent
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
@@ -83,7 +83,7 @@ class Daemon:
         """
         self.settings = settings
         self._hand_settings = settings if hand is None else hand
-        self.clock: Clock = make_clock(settings)
+        self.clock: LoopClock = make_clock(settings)
         self._closers: list[Callable[[], None]] = []
         self.gateway: Gateway | None = None  # process that serves clients
         try:

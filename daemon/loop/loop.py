@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from softfinger.daemon.clock import Clock
+from softfinger.daemon.clock import LoopClock
 from softfinger.daemon.control.modes import GRIPPING_MODES, Mode
 from softfinger.daemon.control.state_machine import Control
 from softfinger.daemon.control.task import Task, TaskEnded
@@ -46,7 +46,7 @@ class Loop:
     def __init__(
         self,
         settings: Settings,
-        clock: Clock,
+        clock: LoopClock,
         servos: Servos | None,
         perception: Perception,
         publisher: Publisher | None,
