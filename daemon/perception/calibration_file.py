@@ -94,7 +94,7 @@ class CentreStep(_StepModel):
     centre: tuple[Finite, Finite]
     rotation: Finite | None  # null if the rotation was not measured
     scale: Finite = 1.0
-    residual: Finite
+    residual: Finite  # change in the centre during the last iteration of the fit [m]
     std: NonNegative = 0.0  # standard deviation of the centre [m]
 
 

@@ -252,7 +252,8 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
     ``current`` [A] and ``reading`` [°C] are sampled at the times ``t`` [s]. ``law`` contains the
     constants of the servo model, which are known to within 40 %. The Gauss-Newton method fits the
     logarithms of the factors. Raises CalibrationError if the case temperature rises by less than 8
-    °C, if there is no current, or if the model does not fit the readings.
+    °C, if there is no current, if the data are longer than an hour, or if the model does not fit
+    the readings.
     """
     at, square, shown = (np.asarray(each, np.float64) for each in (t, np.square(current), reading))
     warmed = float(shown.max() - shown[0]) if shown.size else 0.0
@@ -263,7 +264,7 @@ def fit_heat(law: HeatLaw, t: ArrayLike, current: ArrayLike, reading: ArrayLike)
         )
     if not square.max() > 0.0:
         raise CalibrationError("heat: found no current, expected a servo that measures its current")
-    grid = np.arange(at[0], at[-1], _HEAT_STEP)
+    grid = time_grid(at, _HEAT_STEP)
     squares, readings = np.interp(grid, at, square).tolist(), np.interp(grid, at, shown)
     prior = np.array([0.0, 0.0, shown[0]])
 

@@ -180,6 +180,13 @@ def test_readings_that_the_heat_model_does_not_fit_are_refused(current, rise, to
         fit_heat(law(HeatState()).law, t, np.full_like(t, current), 25.0 + np.round(rise(t)))
 
 
+def test_heat_data_with_a_jump_in_time_are_refused():
+    t = np.append(np.arange(600.0), 1e9)
+    reading = 25.0 + np.linspace(0.0, 20.0, t.size)
+    with pytest.raises(CalibrationError, match="expected at most 3600 s"):
+        fit_heat(law(HeatState()).law, t, np.full_like(t, 0.8), reading)
+
+
 def test_readings_that_the_heat_model_fits_roughly_are_accepted():
     run = recorded(ServoHeat(by_name("XM430-W350"), 1.25, 0.8, 0.8))
     t, current, reading = run.values()

@@ -260,7 +260,7 @@ def _centre(step: Step) -> Done:
     )
     line = (
         f"tip at ({x * 1e3:.3f}, {y * 1e3:.3f}) ± {found.std * 1e3:.3f} mm; {rotation}; "
-        f"{found.residual * 1e6:.0f} µm rms"
+        f"converged to {found.residual * 1e6:.0f} µm"
     )
     return step.result(centre=result), line, (Map("last press [Pa]", step.pressures[-1]),)
 
