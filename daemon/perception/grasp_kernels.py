@@ -23,6 +23,7 @@ from softfinger.daemon.perception.hand_state import (
     ANGLE,
     ANGLE_BIAS,
     D_BIAS,
+    ENCODER,
     FRICTION,
     GAIN,
     GATE,
@@ -182,6 +183,7 @@ def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> T
     h.slopes[:] = 0.0
     h.slopes[ANGLE] = 1.0
     h.slopes[TAPER] = finger - 0.5
+    h.slopes[ENCODER + finger] = 1.0 - 2.0 * finger
     theta_variance = predicted_variance(h) + tip.shared_variance[1]
     h.slopes[:] = 0.0
     d_shared = tip.shared_variance[0]

@@ -413,6 +413,9 @@ def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
         apart = across + 2.0 * h.radius - h.mean[D] - h.mean[D + 1]
         closing_error = MODEL_ERROR * math.hypot(d_step1, 0.5 * apart * rotation)
         sideways_error = MODEL_ERROR * (arm1 * step1 - arm2 * step2)
+        if h.is_single:  # The missing finger does not move.
+            closing_error = MODEL_ERROR * (d_step1 + d_step2)
+            sideways_error = 0.0
         samples = MODEL_ERROR_TIME / dt
         h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
         _walk_d(h, closing_error, sideways_error, samples)

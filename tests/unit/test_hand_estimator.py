@@ -8,7 +8,14 @@ import pytest
 from scipy.optimize import curve_fit
 
 from softfinger.daemon.perception.hand_estimator import HandEstimator
-from softfinger.daemon.perception.hand_state import ENCODER, STATES, HandFilter, correct
+from softfinger.daemon.perception.hand_state import (
+    ANGLE,
+    ENCODER,
+    STATES,
+    TAPER,
+    HandFilter,
+    correct,
+)
 from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import VELOCITY_UNIT
@@ -212,6 +219,43 @@ def test_an_encoder_edge_at_the_expected_angle_changes_no_estimate(estimator):
     estimator.predict(Reading(t=t, q=[q, 0.15], valid=True), Goal())
     estimator.write_contacts(t, contacts, pose)
     assert (contacts[0].theta, contacts[0].d, pose.angle) == pytest.approx(before, abs=1e-8)
+
+
+def test_one_finger_has_the_same_uncertainty_on_both_sides():
+    found = []
+    for finger, name in enumerate(("left", "right")):
+        settings = Settings.model_validate({"scene": {"fingers": (name,)}})
+        table = make_table(settings)
+        estimator = HandEstimator(settings, (table, table))
+        contacts, pose = [Contact(), Contact()], ObjectPose()
+        for k in range(50):
+            t, q, dq = 5.0 + 0.002 * k, [0.0, 0.0], [0.0, 0.0]
+            dq[finger] = 0.2
+            q[finger] = 0.15 + 0.0004 * k
+            estimator.predict(Reading(t=t, q=q, dq=dq, valid=True), Goal())
+            if k == 0:
+                estimate = replace(ESTIMATE, tilt_x=0.1 - 0.2 * finger)
+                estimator.update(finger, frame(t), estimate, contacts[finger])
+        estimator.write_contacts(t, contacts, pose)
+        found.append((contacts[finger].d, contacts[finger].d_std, contacts[finger].theta_std))
+    assert found[0] == pytest.approx(found[1])
+
+
+def test_the_tilt_uncertainty_includes_the_joint_angles(estimator):
+    contacts, pose = [Contact(), Contact()], ObjectPose()
+    covariance = estimator._state.covariance
+    for k in range(40):
+        t, q = 5.0 + 0.002 * k, [0.15 + 0.0004 * k] * 2
+        estimator.predict(Reading(t=t, q=q, dq=[0.2, 0.2], valid=True), Goal())
+        if k % 5 == 0:
+            for finger in range(2):
+                estimator.update(finger, frame(t), ESTIMATE, contacts[finger])
+        estimator.write_contacts(t, contacts, pose)
+    for finger, sense in enumerate((1.0, -1.0)):
+        slopes = np.zeros(STATES)
+        slopes[[ANGLE, TAPER, ENCODER + finger]] = 1.0, -0.5 * sense, sense
+        expected = math.sqrt(slopes @ covariance @ slopes)
+        assert contacts[finger].theta_std == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.52, 1.4])
