@@ -291,8 +291,9 @@ class HandEstimator:
     def _fill_from_frame(self, finger: int, contact: Contact, estimate: ContactEstimate) -> None:
         """Fill ``contact`` with the estimate from a single frame.
 
-        The amplitude of a frame depends on both the tip modulus and the sensor gain. A deviation in
-        amplitude is attributed to modulus and gain in proportion to their prior variances.
+        The amplitude of a frame depends on both the tip modulus and the sensor gain. If the gain
+        was fitted, a deviation in amplitude is attributed to modulus and gain in proportion to
+        their prior variances. Otherwise, the frame measures force × gain.
         """
         table, prior = self._tables[finger], self._priors[finger]
         contact.d, contact.theta = estimate.d, estimate.tilt_x
@@ -306,8 +307,12 @@ class HandEstimator:
         tilt = total_tilt(contact.theta, contact.tilt_y)
         force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
         stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
-        expected = prior.modulus[0] * prior.gain[0]
-        modulus = prior.modulus[0] * (contact.gain / expected) ** (stiff / (stiff + gain))
+        if estimate.covariance[3, 3] > 0.0:
+            expected = prior.modulus[0] * prior.gain[0]
+            modulus = prior.modulus[0] * (contact.gain / expected) ** (stiff / (stiff + gain))
+            factor_variance = stiff * gain / (stiff + gain)
+        else:
+            modulus, factor_variance = contact.gain / prior.gain[0], gain
         contact.force, contact.energy = modulus * force, modulus * energy
         along = contact.theta / tilt if tilt > 0.0 else 0.0
         across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
@@ -316,7 +321,7 @@ class HandEstimator:
         law_error = np.interp(
             fraction, np.linspace(0.0, 1.0, LAW_POINTS), self._state.tip[finger].law_error
         )
-        relative = law_error**2 + stiff * gain / (stiff + gain)
+        relative = law_error**2 + factor_variance
         variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
         contact.force_std = math.sqrt(variance)
 

@@ -16,6 +16,7 @@ from softfinger.daemon.perception.hand_state import (
     HandFilter,
     correct,
 )
+from softfinger.daemon.perception.prior import Prior
 from softfinger.daemon.profile.factory import make_table
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import VELOCITY_UNIT
@@ -151,6 +152,20 @@ def test_the_misfit_of_the_material_law_is_part_of_the_force_error(estimator):
             found.append(contacts[0].force_std / contacts[0].force)
     by_law = law.force_error(0.003 / SETTINGS.tip.radius)
     np.testing.assert_allclose(found[2:], np.hypot(found[:2], by_law), rtol=0.05)
+
+
+@pytest.mark.parametrize(("modulus_error", "gain_error"), [(0.2, 0.01), (0.05, 0.3)])
+def test_a_frame_with_a_fixed_gain_measures_the_product_of_force_and_gain(
+    modulus_error, gain_error
+):
+    table = make_table(SETTINGS)
+    prior = Prior((1.1, modulus_error), (1.4, gain_error), (1.0, 0.1))
+    estimator = HandEstimator(SETTINGS, (table, table), priors=(prior, prior))
+    contact = Contact()
+    fixed = replace(ESTIMATE, covariance=np.diag([1e-12, 1e-12, 0.0, 0.0]))
+    estimator.update(0, frame(5.0), fixed, contact)
+    assert contact.force == pytest.approx(table(0.003, 0.1).force / 1.4)
+    assert contact.force_std == pytest.approx(gain_error * contact.force, rel=0.01)
 
 
 def frame(t: float) -> Frame:
