@@ -59,10 +59,10 @@ def test_changelog_sections_are_short_and_start_with_unreleased(release):
     versions = list(found)
     assert versions[0] == "Unreleased"
     assert versions[1] == softfinger.__version__
-    for version in versions[1:]:
-        kinds = re.findall(r"(?m)^### (.*)$", found[version])
+    for version, text in found.items():
+        kinds = re.findall(r"(?m)^### (.*)$", text)
         assert len(kinds) == len(set(kinds)), version
-        assert sum(bool(line) for line in found[version].splitlines()) < release.MAX_LINES
+        assert sum(bool(line) for line in text.splitlines()) < release.MAX_LINES, version
 
 
 def test_unreleased_entries_move_below_the_version_and_its_date(release):
