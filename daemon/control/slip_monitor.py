@@ -27,13 +27,14 @@ increased by the load that friction may hide. An unconfirmed load increases the 
 most the fraction _UNCONFIRMED_SHARE. A load is confirmed when the object rotates, when both joints
 yield simultaneously, or when |L| exceeds 2 joint_friction/load_arm.
 
-**Sudden events** increase the force immediately. The force increases to its limit if the torques
-jump by more than the noise while both joints yield. With solid tips, a jump in the measured shear
-has the same effect. Because the tips shear, the object can rotate by μ (d1 + d2)/2W without
-slipping. If the object rotates further, the force increases by the fraction _ROTATION_INCREASE. A
-sliding tip transmits only its friction force, so the size of a sudden load is unknown. A pull
-changes both torques in the same direction. A twist changes the torques in opposite directions. A
-sideways push has the same effect on the torques as a twist.
+**Sudden events** increase the force to its limit immediately, because a sliding tip transmits only
+its friction force, so the size of the load is unknown. An event is one of these:
+
+- The torques jump by more than the noise while both joints yield. A pull changes both torques in
+  the same direction. A twist or a sideways push changes them in opposite directions.
+- The shear that solid tips measure jumps.
+- The object rotates by more than μ (d1 + d2)/2W. Up to this angle, the tips can shear without
+  slipping.
 
 A force increase is held for _SETTLING_TIME. The increase then decays at the rate
 increase_max/_DECAY_TIME.
@@ -47,7 +48,7 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.perception.grasp import GraspState
-from softfinger.daemon.perception.hand_state import GATE, OUTLIER_GATE
+from softfinger.daemon.perception.hand_state import AGREEMENT, GATE, OUTLIER_GATE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import GRIP_FRACTION
@@ -59,9 +60,7 @@ _AVERAGE_TIME = 0.1  # averaging time [s]; velocity readings fluctuate by one co
 _SETTLING_TIME = 1.0  # settling time of the residual, and hold time of a force increase [s]
 _DECAY_TIME = 2.0  # time to reduce the force by `grip_raise_max`, and decay time of rotations [s]
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
-_ROTATION_INCREASE = 0.5  # relative force increase after the object has rotated
 _SHEAR_JUMP = 0.6  # smallest significant shear jump at solid tips [N]; equals 6 σ of the noise
-_AGREEMENT = 0.25  # minimum change at each joint or tip, as a fraction of the mean change
 _UNCONFIRMED_SHARE = 0.3  # maximum force increase without confirmation, as a fraction of the force
 _RELAXATION_SHARE = 0.2  # maximum relative force loss due to relaxation during a hold
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
@@ -274,10 +273,7 @@ def _increased_force(s: SlipState, grasp: GraspState, commanded: float, sudden: 
     s.balanced_max = max(s.law.force_max - imbalance, commanded)
     s.force_limit = _force_limit(s, commanded, 0.5 * s.law.object_load / s.usable_friction)
     needed_force = s.assumed_load / s.usable_friction
-    if s.has_turned:
-        turned_force = (1.0 + _ROTATION_INCREASE) * max(commanded, s.needed_force)
-        needed_force = max(needed_force, turned_force)
-    if sudden:
+    if s.reflex_triggered:
         needed_force = s.force_limit
     _update_needed_force(s, needed_force, commanded)
     return min(max(commanded, s.needed_force), s.force_limit)
@@ -358,7 +354,7 @@ def _has_jumped(
     change = 0.5 * (changes[0] + sense * changes[1])
     smaller = min(changes[0] * change, sense * changes[1] * change)
     noise = GATE * math.sqrt(s.variance[kind])
-    if smaller <= _AGREEMENT * change * change or abs(change) <= noise:
+    if smaller <= AGREEMENT * change * change or abs(change) <= noise:
         return False
     sign = math.copysign(1.0, change)
     yield1 = sign * (s.speed[0] - dq[0])
@@ -449,7 +445,7 @@ def _has_turned(s: SlipState, grasp: GraspState) -> bool:
         s.rotation[k] += grasp.unexplained_rotation[k] - s.rotation_seen[k]
         s.rotation[k] -= s.rotation[k] * s.law.dt / _DECAY_TIME
     total = s.rotation[0] + s.rotation[1]
-    agrees = min(s.rotation[0] * total, s.rotation[1] * total) > _AGREEMENT * total * total
+    agrees = min(s.rotation[0] * total, s.rotation[1] * total) > AGREEMENT * total * total
     by_shear = 0.5 * s.law.tip_friction * (grasp.d[0] + grasp.d[1]) / s.law.width
     noise = OUTLIER_GATE * grasp.angle_std
     turned: bool = agrees and abs(total) > by_shear + noise

@@ -26,7 +26,7 @@ Several states share these transitions:
 - In every state with torque, `release` leads to Travelling (RELEASING).
 - In Settled, Changing and Turning, `rotate` leads to Turning.
 - In the states from Approaching to Turning, the hand enters Travelling (RELEASING) if the tips
-  touch each other for _EMPTY_TIME.
+  touch each other for `safety.frame_age_hold` frame periods.
 - In the states from Pressing to Turning, the joints hold their positions while a contact is
   missing. If the contact is missing for `safety.frame_age_fault` frame periods, the hand enters
   Armed.
@@ -63,19 +63,8 @@ _FRICTION_TOLERANCE = 0.1
 # force within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the
 # settling time of the force in a hand without friction.
 _STUCK_TIME = 2.0
-# A grip counts as empty once the tips have appeared to touch each other for this long [s].
-# _EMPTY_TIME is longer than one frame period at 25 Hz.
-_EMPTY_TIME = 0.05
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
-# Tolerance for a streamed force target, as a fraction of the target. A streamed target may never
-# stop changing. A grip therefore also counts as settled if the force has reached a setpoint within
-# the tolerance.
-_STREAM_TOLERANCE = 0.25
-# Limits below which a change in a streamed setpoint, or a force increase, counts as noise.
-# _FORCE_NOISE is a fraction of the force. _ANGLE_NOISE is the standard deviation of the angle
-# [rad].
-_FORCE_NOISE, _ANGLE_NOISE = 0.02, 2e-3
 
 
 class ControlState:
@@ -189,6 +178,8 @@ class Control:
         self.events: list[Event] = []
         # Maximum duration of a contact loss [s], equal to the maximum time without frames.
         self._contact_loss_time = settings.safety.frame_age_fault / settings.tactile.rate
+        # A grip counts as empty if the tips have appeared to touch each other for this long [s].
+        self._empty_time = settings.safety.frame_age_hold / settings.tactile.rate
         # Settling time [s]. Force and angle count as settled when they have stayed at their targets
         # for this time. The settling time is twice `control.smooth_time` because the setpoints are
         # averaged twice.
@@ -334,9 +325,9 @@ class Control:
         Any force command restarts the dither of the upright law, which also moves the joints.
         """
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
-        same_force = abs(grip.commanded - force) < _FORCE_NOISE * force and not grip.is_dithering
-        off = abs(grip.target_angle - angle)
-        same_angle = math.isnan(grip.target_angle) or off < _ANGLE_NOISE
+        change, off = abs(grip.commanded - force), abs(grip.target_angle - angle)
+        same_force = change < _FORCE_TOLERANCE * force and not grip.is_dithering
+        same_angle = math.isnan(grip.target_angle) or off < _ANGLE_TOLERANCE
         if isinstance(state, Settled) and not (same_force and same_angle):
             self._enter(Changing(state.history))
 
@@ -423,14 +414,14 @@ class Control:
     def _empty_for(self, before: float, dt: float) -> float:
         """Return the duration [s] of apparent contact between the tips.
 
-        The fingers open after _EMPTY_TIME, because tips that press against each other would roll
+        The fingers open after `_empty_time`, because tips that press against each other would roll
         off to one side. When the tips touch each other, both sensors measure the same contact. The
         estimated object width is then 0 to within its standard error.
         """
         pose, width_min = self.fingers.pose, self._settings.object.width_min
         if not pose.valid or pose.width >= width_min:
             return 0.0
-        if before + dt > _EMPTY_TIME:
+        if before + dt > self._empty_time:
             text = (
                 f"no object between the tips: their distance is {pose.width * 1e3:.1f} mm, "
                 f"expected at least object.width_min = {width_min * 1e3:g} mm; the hand opens"
@@ -508,7 +499,7 @@ class Control:
         wanted = grip.force.value if is_streamed else grip.target
         over = _FORCE_TOLERANCE + min(self._settings.control.load_held, _FRICTION_TOLERANCE)
         off = self.fingers.force - wanted
-        is_near = abs(wanted - grip.target) < _STREAM_TOLERANCE * grip.target
+        is_near = abs(wanted - grip.target) < _FRICTION_TOLERANCE * grip.target
         is_there = -_FORCE_TOLERANCE * grip.target < off < over * grip.target
         return is_near and is_there and not grip.is_dithering
 
@@ -531,9 +522,10 @@ class Control:
         grip = self.grip
         if grip.slip.has_turned:
             self._warn("slip", "the object is rotating in the grip")
+        margin = _FORCE_TOLERANCE * grip.commanded
         if grip.target <= grip.commanded:
             history.increase_reported = False
-        elif not history.increase_reported and grip.target > (1 + _FORCE_NOISE) * grip.commanded:
+        elif not history.increase_reported and grip.target > grip.commanded + margin:
             history.increase_reported = True
             why = "the object rotates" if grip.slip.has_turned else "sudden load"
             if grip.slip.assumed_load > 0.0:

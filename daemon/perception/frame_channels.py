@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from softfinger.daemon.perception.grasp import AMPLITUDE, ANGLE_CHANNEL, FOOTPRINT
 from softfinger.daemon.perception.hand_state import (
+    AGREEMENT,
     ANGLE,
     ANGLE_BIAS,
     D_BIAS,
@@ -37,6 +38,7 @@ from softfinger.daemon.perception.hand_state import (
     TAPER,
     TORQUE,
     TORQUE_NOISE,
+    VELOCITY_TIME,
     D,
     HandFilter,
     HistoryRow,
@@ -62,12 +64,8 @@ D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
 # shift of 0.06 radii changes the measured angle by 0.06 rad. Without a shift, the angle error of a
 # frame is at most 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
-_JUMP_SUPPORT = 0.5  # fraction of a jump that the other tip must show to confirm the jump
-_NORMAL_FORCE_MIN = 1.0  # minimum force per tip [N]; an object held with less force may rock
-_RATE_INTERVAL_MIN = 0.005  # minimum interval for computing the rates of d and θ [s]
 _SLOPE_SMOOTHING = 0.9  # low-pass filter coefficient for ∂ ln F/∂d, applied on each frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
-_FIRST_D_ERROR = 0.5  # relative standard deviation of d at the touch if only the amplitude shows d
 
 
 class FrameContact(NamedTuple):
@@ -140,11 +138,11 @@ def _rates(
     ±1 standard deviation of the latency, because the joints may have stopped within this interval.
     Rates below the velocity resolution are set to 0.
     """
-    span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), _RATE_INTERVAL_MIN)
+    span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), VELOCITY_TIME)
     first = _motion_at(history, h.newest_row, scan - span, finger)
     end = min(scan + span, h.t)
     last = _motion_at(history, h.newest_row, end, finger)
-    span = max(end - (scan - span), _RATE_INTERVAL_MIN)
+    span = max(end - (scan - span), VELOCITY_TIME)
     d_rate = (last.d - first.d) / span
     theta_rate = (last.angle - first.angle - sense * (last.q - first.q)) / span
     if abs(d_rate) < h.velocity_unit * h.length:
@@ -232,8 +230,7 @@ def update(
     is_new_contact = not tip.in_contact
     if is_new_contact:
         _begin_contact(h, finger, sense, face + scan.rotation)
-        first_error = h.radius if shows_d else _FIRST_D_ERROR * d
-        reset(h, D + finger, d + scan.d, first_error * first_error)
+        reset(h, D + finger, d + scan.d, h.radius * h.radius)
     pending_variance = 0.0
     if shows_d:  # Otherwise, only frames during motion separate d from the gain.
         # All frames within `settling_time` have similar errors, so they count as one measurement.
@@ -243,7 +240,7 @@ def update(
     angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - scan.rotation
     angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
     d_innovation = d - (d_at_scan + h.mean[D_BIAS + finger])
-    if is_held(h) and min(h.grasp.normal[0], h.grasp.normal[1]) > _NORMAL_FORCE_MIN:
+    if is_held(h) and min(h.grasp.normal[0], h.grasp.normal[1]) > h.contact_force:
         jump = (angle_innovation, d_innovation if is_fitted else 0.0)
         if _is_rejected(h, finger, sense, scan, jump, (theta_noise, d_noise)):
             return False
@@ -413,8 +410,8 @@ def _is_rejected(
     joints_move = abs(tip.speed) + abs(h.tip[other].speed) > 4.0 * h.velocity_unit
     grasp.angle_jump[finger] = angle
     grasp.d_jump[finger] = d
-    angle_agrees = angle * grasp.angle_jump[other] > _JUMP_SUPPORT * angle * angle
-    d_agrees = abs(grasp.d_jump[other]) >= _JUMP_SUPPORT * abs(d)
+    angle_agrees = angle * grasp.angle_jump[other] > AGREEMENT * angle * angle
+    d_agrees = abs(grasp.d_jump[other]) >= AGREEMENT * abs(d)
     is_rejected: bool = (angle_jumps and not (angle_agrees and joints_move)) or (
         d_jumps and not (d_agrees or joints_move)
     )

@@ -88,6 +88,7 @@ class HandEstimator:
         state.frame_rate = settings.tactile.rate
         state.frame_age_max = settings.safety.frame_age_fault / settings.tactile.rate
         state.rejected_max = settings.safety.frame_age_hold
+        state.contact_force = settings.control.contact_force
         state.response = settings.tactile.response
         state.relaxation[:] = settings.tip.relaxation
         state.relaxation_time[:] = settings.tip.relaxation_times
