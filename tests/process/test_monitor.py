@@ -107,7 +107,7 @@ def test_keys_command_the_hand(fake):
             (b"g", {"command": "grasp"}, "✓ grasp: ok"),
             (b"c", {"command": "clear"}, "✗ clear: not accepted in mode holding"),
             (b"r", {"command": "release"}, "✓ release: ok"),
-            (b"a", {"command": "arm"}, "✗ arm: invalid answer"),
+            (b"a", {"command": "arm"}, "sent an invalid reply"),
             (b"w", {"command": "demo"}, "✓ demo: ok"),
             (b" ", {"command": "stop"}, "✓ stop: ok"),
         ):

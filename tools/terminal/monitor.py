@@ -164,8 +164,8 @@ def run(args: argparse.Namespace) -> int:
         if keys is not None:
             keys.guard(context)
         socket = subscribe(context, state, *feed.topics, queue=DRAIN_COUNT_MAX)
-        commander = Commander(context, commands, args.client)
-        with _MonitorStop(args) as ending:
+        commander = Commander(commands, args.client, keys)
+        with _MonitorStop(args) as ending, contextlib.closing(commander):
             if _is_page(args):
                 page = MonitorPage(feed, state, guarded=keys is not None)
                 _run_page(page, socket, commander, ending)
@@ -289,7 +289,6 @@ def _page_loop(
             continue
         keys.settle()
         page.feed.drain(socket, now)
-        commander.collect(now)
         ending.watch(page.feed, page.address, now)
         page.force = hand.force(now)
         width, height = terminal.size()

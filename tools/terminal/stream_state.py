@@ -7,30 +7,31 @@ or empty. Messages that cannot be decoded are counted and skipped.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import time
 from bisect import insort
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from queue import Full, Queue
+from threading import Thread
 from typing import Any, NamedTuple
 
-import msgpack
 import numpy as np
 import zmq
 from numpy.typing import NDArray
 
 from softfinger.daemon.client.command_client import (
     LOCAL_STOP_TIMEOUT,
-    RETRY_DELAY,
     UNCONFIRMED_TEXT,
-    Attempts,
+    NoAnswer,
+    send,
 )
-from softfinger.daemon.client.connection import REPLY_TIMEOUT, SILENCE_TIME, drain, unpack
+from softfinger.daemon.client.connection import REPLY_TIMEOUT, drain, unpack
 from softfinger.daemon.client.stream import Gaps, read
 from softfinger.daemon.types import FINGERS, GRIP_FRACTION, NO_LEASE_COMMANDS
 from softfinger.daemon.wire import schema
-from softfinger.daemon.wire.local_stop import stop_locally
+from softfinger.daemon.wire.keys import ClientKeys
 
 RECENT_TIME = 3.0  # period over which a simulated hand's pauses are summed [s]
 EVENT_COUNT_MAX = 200  # number of stored events
@@ -50,7 +51,6 @@ _INCREASED_RATIO = 1.01
 # Maximum number of messages read per call, so that a flood of messages cannot block drawing.
 DRAIN_COUNT_MAX = 4000
 INVALID = (ValueError, TypeError, RecursionError)  # raised by `StreamState.process`
-_MESSAGE_SIZE_MAX = 4_000_000  # maximum message size [bytes]; the largest frame has 131 kB
 
 
 def field(record: object, *path: str) -> Any:
@@ -292,101 +292,76 @@ class ShownReply(NamedTuple):
     text: str
 
 
-@dataclass(slots=True)
-class _Pending:
-    """Command whose reply has not arrived yet."""
-
+class _Command(NamedTuple):
+    pressed: float  # monotonic time [s]
     label: str
-    socket: zmq.Socket[bytes]
-    attempts: Attempts
-    sent: float
-    # Reply that refused the command because of a delay, stored until the command is sent again.
-    late: dict[str, Any] | None = None
-    again_at: float = 0.0  # time at which the command is sent again
-    warned: bool = False  # True once the page has reported the missing reply
+    request: dict[str, Any]
 
 
-class Commander:
-    """Send commands without waiting for replies; ``reply`` is the newest reply.
+class Commander(logging.Handler):
+    """Send commands in other threads; ``reply`` is the newest reply.
 
-    Each command uses its own request socket, so a missing reply does not delay other commands. If
-    the same user runs the daemon on this machine, a stop command bypasses the queue of requests.
-    The daemon replies to the stop on the next tick. If the daemon is stalled, the client waits only
-    briefly for this reply.
+    A command is sent after the reply to the previous command. A stop does not wait for other
+    commands, and discards the commands that have not been sent yet. As a logging handler, the
+    commander shows the warning that `send` logs if a reply takes long.
     """
 
-    OPEN_LIMIT = 8  # maximum number of open commands; further commands are dropped, except stop
+    QUEUE_LENGTH = 8  # maximum number of waiting commands; further commands are dropped
 
-    def __init__(self, context: zmq.Context[Any], address: str, client: str = "") -> None:
-        self._context = context
+    def __init__(self, address: str, client: str = "", keys: ClientKeys | None = None) -> None:
+        super().__init__()
         self._address = address
+        self._keys = keys
         self._envelope = {"client": client} if client else {}
-        self._pending: list[_Pending] = []
+        self._queue: Queue[_Command] = Queue(self.QUEUE_LENGTH)
+        self._stopped = -math.inf  # time of the last stop
+        self._stopping: list[Thread] = []
         self.reply: ShownReply | None = None
+        logging.getLogger(send.__module__).addHandler(self)
+        Thread(target=self._carry_out_queue, daemon=True).start()
 
     def send(self, now: float, label: str, command: str, **fields: float) -> None:
         """Send ``command`` with ``fields``; label its reply with ``label``."""
-        if len(self._pending) >= self.OPEN_LIMIT and command != "stop":
+        asked = _Command(now, label, {"command": command, **self._envelope, **fields})
+        if command == "stop":
+            self._stopped = now
+            self._stopping.append(Thread(target=self._carry_out, args=(asked,), daemon=True))
+            self._stopping[-1].start()
+            return
+        try:
+            self._queue.put_nowait(asked)
+        except Full:
             self.refuse(now, f"{label}: discarded because the daemon does not respond")
-            return
-        if (
-            command == "stop"
-            and (stopped := stop_locally(self._address, LOCAL_STOP_TIMEOUT)) is not None
-        ):
-            self.reply = judge(now, label, stopped)
-            return
-        attempts = Attempts({"command": command, **self._envelope, **fields}, REPLY_TIMEOUT)
-        request = self._context.socket(zmq.REQ)
-        request.setsockopt(zmq.LINGER, 0)
-        request.setsockopt(zmq.MAXMSGSIZE, _MESSAGE_SIZE_MAX)
-        request.connect(self._address)
-        request.send(msgpack.packb(attempts.request), zmq.NOBLOCK)
-        self._pending.append(_Pending(label, request, attempts, now))
 
     def refuse(self, now: float, why: str) -> None:
         """Show the reason why a command failed or was not sent."""
         self.reply = ShownReply(now, False, why)
 
-    def collect(self, now: float) -> None:
-        """Process received replies, and discard commands whose replies are overdue."""
-        for each in list(self._pending):
-            if each.late is not None:
-                if now < each.again_at:
-                    continue
-                if each.attempts.remaining():
-                    each.late = None
-                    each.socket.send(msgpack.packb(each.attempts.request), zmq.NOBLOCK)
-                else:  # The process was suspended during the wait.
-                    self._end(each, now, each.late)
-                continue
-            try:
-                payload = each.socket.recv(zmq.NOBLOCK)
-            except zmq.Again:
-                overdue = now - each.sent >= REPLY_TIMEOUT
-                if overdue or (not each.warned and now - each.sent >= SILENCE_TIME):
-                    each.warned = True
-                    timeout = f"{REPLY_TIMEOUT:g} s"
-                    so_far = f"within {timeout}" if overdue else f"yet; waiting up to {timeout}"
-                    self.refuse(now, f"{each.label}: no reply from {self._address} {so_far}")
-                if overdue:
-                    self._close(each)
-                continue
-            try:
-                record = msgpack.unpackb(payload)
-            except (ValueError, RecursionError, msgpack.UnpackException):
-                record = None
-            if isinstance(record, dict) and each.attempts.again(record):
-                each.late, each.again_at = record, now + RETRY_DELAY
-            else:
-                self._end(each, now, record)
+    def emit(self, record: logging.LogRecord) -> None:
+        self.refuse(time.monotonic(), record.getMessage())
 
-    def _end(self, command: _Pending, now: float, record: Any) -> None:
-        self.reply = judge(now, command.label, record)
-        self._close(command)
+    def close(self) -> None:
+        """Wait briefly until the last stop has been sent."""
+        for each in self._stopping[-1:]:
+            each.join(LOCAL_STOP_TIMEOUT)
+        super().close()
 
-    def _close(self, command: _Pending) -> None:
-        command.socket.close()
-        self._pending.remove(command)
+    def _carry_out_queue(self) -> None:
+        while True:
+            asked = self._queue.get()
+            if asked.pressed > self._stopped:
+                self._carry_out(asked)
+
+    def _carry_out(self, asked: _Command) -> None:
+        remaining = round(asked.pressed + REPLY_TIMEOUT - time.monotonic(), 1)
+        if remaining <= 0.0:  # The daemon has not replied to the previous commands.
+            return
+        try:
+            reply = send(self._address, asked.request, remaining, self._keys)
+        except NoAnswer as error:
+            self.refuse(time.monotonic(), f"{asked.label}: {error}")
+        else:
+            self.reply = judge(time.monotonic(), asked.label, reply)
 
 
 def judge(now: float, label: str, record: Any) -> ShownReply:
