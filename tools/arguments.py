@@ -11,7 +11,7 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.own_files import runtime_fault, runtime_folder
@@ -23,35 +23,20 @@ if TYPE_CHECKING:
 WAIT_MAX = 5.0  # time limit for the first message with `--no-wait` [s]
 
 
-def add_profile(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config``, ``--set`` and ``--dir``; `profile` loads the settings that they select."""
-    add_settings(parser)
-    add_directory(parser)
+def add_profile(
+    parser: argparse.ArgumentParser, *, config: bool = True, folder: bool = True
+) -> None:
+    """Add ``--config``, ``--set`` and ``--dir``; `profile` loads the settings that they select.
 
-
-def add_directory(parser: argparse.ArgumentParser) -> None:
-    """Add ``--dir``."""
-    parser.add_argument(
-        "--dir",
-        type=Path,
-        metavar="DIR",
-        help="replaces {dir} in port paths (default: the folder of `softfinger emulate`)",
-    )
-
-
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config`` and ``--set`` to a subcommand that defines its own ``--dir``."""
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="PROFILE",
-        help="settings: a TOML file, or a profile name listed by `softfinger config list`",
-    )
-    add_changes(parser)
-
-
-def add_changes(parser: argparse.ArgumentParser) -> None:
-    """Add ``--set``."""
+    A subcommand can define its own argument ``config`` or ``dir`` instead.
+    """
+    if config:
+        parser.add_argument(
+            "--config",
+            type=Path,
+            metavar="PROFILE",
+            help="settings: a TOML file, or a profile name listed by `softfinger config list`",
+        )
     parser.add_argument(
         "--set",
         action="append",
@@ -59,15 +44,19 @@ def add_changes(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="override a setting, e.g. loop.rate=1000; can be given several times",
     )
+    if folder:
+        parser.add_argument(
+            "--dir",
+            type=Path,
+            metavar="DIR",
+            help="replaces {dir} in port paths (default: the folder of `softfinger emulate`)",
+        )
 
 
 def profile(arguments: argparse.Namespace) -> Settings:
     """Load the settings selected with the `add_profile` arguments.
 
-    Raises
-    ------
-    SettingsError
-        If the settings are invalid; the message lists all errors.
+    Raises SettingsError, whose message lists all errors in the settings.
     """
     from softfinger.daemon.profile.load import load
 
@@ -86,12 +75,7 @@ def own_runtime_folder() -> Path | None:
 
 
 def client_keys(folder: Path | None) -> ClientKeys | None:
-    """Load the client keys from the folder ``--keys``; a socket needs them before it connects.
-
-    Raises
-    ------
-    KeyFileError
-    """
+    """Load the client keys from the folder ``--keys``. Raises KeyFileError."""
     if folder is None:
         return None
     from softfinger.daemon.wire.keys import load_client
@@ -99,31 +83,11 @@ def client_keys(folder: Path | None) -> ClientKeys | None:
     return load_client(folder)
 
 
-def stream_address(text: str) -> str:
-    """Parse the stream address, given as a socket address, ``tcp://HOST`` or ``STREAM,COMMANDS``.
-
-    An empty string selects SOFTFINGER_ADDRESS or, if the variable is unset, the default address on
-    this machine.
-
-    Raises
-    ------
-    ArgumentTypeError
-    """
-    return addresses(text)[0]
-
-
-def command_address(text: str) -> str:
-    """Parse the command address; see `stream_address`."""
-    return addresses(text)[1]
-
-
 def addresses(text: str) -> tuple[str, str]:
     """Parse the stream and command addresses; a single socket address is used for both.
 
-    Raises
-    ------
-    ArgumentTypeError
-        If an address is malformed, or its host is unknown.
+    An empty string selects SOFTFINGER_ADDRESS or, if the variable is unset, the default addresses
+    on this machine. Raises ArgumentTypeError if an address is malformed, or its host is unknown.
     """
     from softfinger.daemon.client.connection import both_addresses, is_host, require_address
 
@@ -164,10 +128,7 @@ def number(
 ) -> float:
     """Parse a number within bounds.
 
-    Raises
-    ------
-    ArgumentTypeError
-        The message contains ``text`` and ``what``, the description of a valid number.
+    Raises ArgumentTypeError with ``what``, the description of a valid number.
     """
     try:
         value = float(text)
@@ -181,11 +142,6 @@ def number(
 def seconds(text: str) -> float:
     """Parse a time above 0 s; raise ArgumentTypeError if the text is invalid."""
     return number(text, "a time above 0 s", 0.0)
-
-
-def megabytes(text: str) -> float:
-    """Parse a size above 0 MB; raise ArgumentTypeError if the text is invalid."""
-    return number(text, "a size above 0 MB", 0.0)
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:
@@ -214,12 +170,14 @@ def range_text(arguments: argparse.Namespace) -> str:
     return " between --from and --to" if selected else ""
 
 
-def add_daemon(
-    parser: argparse.ArgumentParser, kind: Callable[[str], Any], client: bool = False
-) -> None:
-    """Add ``--address`` and ``--keys``; add ``--client`` if the program sends commands."""
-    where = "daemon address: tcp://HOST, a pair STREAM,COMMANDS, or the address of one socket"
-    parser.add_argument("--address", type=kind, default="", help=where)
+def add_daemon(parser: argparse.ArgumentParser, client: bool = False) -> None:
+    """Add ``--address``, parsed by `addresses`, and ``--keys``; optionally add ``--client``."""
+    parser.add_argument(
+        "--address",
+        type=addresses,
+        default="",
+        help="daemon address: tcp://HOST, a pair STREAM,COMMANDS, or the address of one socket",
+    )
     parser.add_argument(
         "--keys",
         type=Path,
@@ -227,17 +185,12 @@ def add_daemon(
         help="folder with this client's keys, created by `softfinger keys`",
     )
     if client:
-        name = "client name, to which the lease is bound"
-        parser.add_argument("--client", default="", help=name)
+        parser.add_argument("--client", default="", help="client name, to which the lease is bound")
 
 
-def add_stream(
-    parser: argparse.ArgumentParser,
-    kind: Callable[[str], Any] = stream_address,
-    client: bool = False,
-) -> None:
+def add_stream(parser: argparse.ArgumentParser, client: bool = False) -> None:
     """Add a subscriber's arguments: ``--no-wait``, ``--duration`` and those of `add_daemon`."""
-    add_daemon(parser, kind, client)
+    add_daemon(parser, client)
     parser.add_argument(
         "--no-wait",
         action="store_true",
@@ -259,7 +212,7 @@ def add_split(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument(
         "--split-size",
-        type=megabytes,
+        type=lambda text: number(text, "a size above 0 MB", 0.0),
         metavar="MB",
         help="start a new file when this size is reached",
     )
@@ -272,13 +225,7 @@ ALL = b"all"
 
 
 def topic(text: str) -> bytes:
-    """Parse ``all`` or the name of a stream topic, with or without ``hand/``.
-
-    Raises
-    ------
-    ArgumentTypeError
-        The message contains ``text``.
-    """
+    """Parse ``all`` or a topic name, with or without ``hand/``. Raises ArgumentTypeError."""
     from softfinger.daemon.wire import schema
 
     if text.encode() == ALL:

@@ -1,9 +1,9 @@
 """Parse the command line and run the selected subcommand.
 
 Each subcommand is a module in a ``tools/`` package and is imported only when called. The module
-defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For invalid settings, the
-module raises SettingsError (exit status 2). For other errors that the user can correct, the module
-raises another SoftfingerError or an OSError (exit status 1).
+defines ``add_arguments(parser)`` and ``run(arguments) -> exit status``. For invalid settings or
+contradictory arguments, the module raises SettingsError (exit status 2). For other errors that the
+user can correct, the module raises another SoftfingerError or an OSError (exit status 1).
 """
 
 from __future__ import annotations

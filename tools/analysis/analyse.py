@@ -66,8 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(_analysed(arguments, settings, files[0]), end="")
         return 0
     if arguments.csv:
-        print("analyse: --csv requires exactly one FILE", file=sys.stderr)
-        return 2
+        raise SettingsError("analyse: --csv requires exactly one FILE")
     status = 0
     _compile(settings)
     found = Sweep("analyse", partial(_one_of_many, arguments, settings), files)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.wire.schema import STATE, HandState
-from softfinger.tools.arguments import add_daemon, add_profile, addresses, number, profile
+from softfinger.tools.arguments import add_daemon, add_profile, number, profile
 from softfinger.tools.extras import MissingExtra
 from softfinger.tools.recordings.reader import Recording
 
@@ -123,7 +123,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "and {pose} are replaced (pose: closed, open or zero)",
     )
     parser.add_argument("--no-plot", action="store_true", help="do not plot the result")
-    add_daemon(parser, addresses)  # The `friction`, `latency` and `scales` steps use this option.
+    add_daemon(parser)  # The `friction`, `latency` and `scales` steps use this option.
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.own_files import runtime_fault
-from softfinger.tools.arguments import add_settings, own_runtime_folder, profile
+from softfinger.tools.arguments import add_profile, own_runtime_folder, profile
 from softfinger.tools.stop_condition import Interrupted, Signals
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="your own folder for the links servos, tactile-left and tactile-right; created if "
         "it does not exist (default: a folder in your runtime folder)",
     )
-    add_settings(parser)
+    add_profile(parser, folder=False)
     parser.add_argument("--model", metavar="NAME", help="servo model")
     parser.add_argument(
         "--ids",

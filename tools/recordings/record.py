@@ -247,6 +247,7 @@ class _Recorder:
 
     def __init__(self, arguments: argparse.Namespace, ending: StopCondition) -> None:
         self._arguments = arguments
+        self._address = arguments.address[0]
         self._ending = ending
         self._keys = client_keys(arguments.keys)  # Report unusable keys before creating a file.
         self._gaps: dict[bytes, Gaps] = {}
@@ -266,11 +267,11 @@ class _Recorder:
         try:
             if self._keys is not None:
                 self._keys.guard(context)
-            socket = subscribe(context, arguments.address, *_topics(arguments.topics))
+            socket = subscribe(context, self._address, *_topics(arguments.topics))
             failure = self._take_all(socket)
             self._writers[-1].close()
         except zmq.ZMQError as error:
-            failure = f"{arguments.address}: {error}"
+            failure = f"{self._address}: {error}"
         except RecordingError as error:
             failure = str(error)
         finally:
@@ -294,11 +295,11 @@ class _Recorder:
                 last = now
             elif not self._messages and now - began > _SILENCE_TIME:
                 if arguments.no_wait and now - began > WAIT_MAX:
-                    failure = no_stream(arguments.address, arguments.keys)
+                    failure = no_stream(self._address, arguments.keys)
                     break
                 if not self._waiting:
                     self._waiting = True
-                    to_stderr("record")(waiting(arguments.address, arguments.keys))
+                    to_stderr("record")(waiting(self._address, arguments.keys))
             if now - shown >= _PROGRESS_INTERVAL:
                 self._writers[-1].flush()
                 self._show(now - began, now - last)

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softfinger.daemon.errors import AddressError, RecordingError
+from softfinger.daemon.errors import AddressError, RecordingError, SettingsError
 from softfinger.daemon.gateway.bounds import Config
 from softfinger.daemon.gateway.supervisor import Gateway
 from softfinger.daemon.profile.settings import StreamSettings
@@ -77,22 +77,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Publish the recording, or recompute its states and compare them with the recorded states.
 
-    Returns 2 if the options contradict each other.
-
-    Raises
-    ------
-    RecordingError, SettingsError, TactileError, OSError
+    Raises RecordingError, SettingsError, TactileError or OSError.
     """
     from softfinger.tools.recordings.reader import Recording
 
-    problem = ""
     if arguments.recompute and (range_text(arguments) or arguments.speed != 1.0):
-        problem = "--recompute processes the whole recording; remove --from, --to and --speed"
-    elif arguments.config is not None and not arguments.recompute:
-        problem = "--config requires --recompute"
-    if problem:
-        to_stderr("replay")(problem)
-        return 2
+        raise SettingsError(
+            "replay: --recompute processes the whole recording; remove --from, --to and --speed"
+        )
+    if arguments.config is not None and not arguments.recompute:
+        raise SettingsError("replay: --config requires --recompute")
     recording = Recording(arguments.file, to_stderr("replay"))
     if arguments.recompute:
         return _recompute(arguments, recording)

@@ -9,7 +9,7 @@ from pathlib import Path
 from softfinger.daemon.errors import SettingsError, SoftfingerError
 from softfinger.daemon.profile import reference
 from softfinger.daemon.profile.load import examine, find, names, profile_text
-from softfinger.tools.arguments import add_changes, add_directory, own_runtime_folder
+from softfinger.tools.arguments import add_profile, own_runtime_folder
 
 _EPILOG = """\
   softfinger config check my.toml           print all errors and warnings; exit status 1 for errors
@@ -37,8 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     check.add_argument("config", type=Path, metavar="FILE", help="a TOML file, or a profile name")
-    add_changes(check)
-    add_directory(check)
+    add_profile(check, config=False)
     actions.add_parser("list", help="list the profile names")
     show = actions.add_parser("show", help="print a profile")
     show.add_argument("profile", type=Path, metavar="PROFILE", help=f"one of {', '.join(names())}")

@@ -24,7 +24,6 @@ from softfinger.daemon.control.modes import GRIPPING_MODES
 from softfinger.tools.arguments import (
     WAIT_MAX,
     add_stream,
-    addresses,
     client_keys,
     no_stream,
     to_stderr,
@@ -141,7 +140,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Show the hand on a live terminal page with keys to arm, grasp, rotate, release, stop and\n"
         "change the force. If the output is not a terminal, print a plain line every second."
     )
-    add_stream(parser, addresses, client=True)
+    add_stream(parser, client=True)
     parser.add_argument(
         "--plain", action="store_true", help="print plain lines instead of the page"
     )

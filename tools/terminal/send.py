@@ -14,7 +14,7 @@ from softfinger.daemon.client.command_client import UNCONFIRMED_TEXT, NoAnswer, 
 from softfinger.daemon.client.connection import REPLY_TIMEOUT
 from softfinger.daemon.control.modes import COMMANDS
 from softfinger.daemon.errors import KeyFileError
-from softfinger.tools.arguments import add_daemon, client_keys, command_address, seconds
+from softfinger.tools.arguments import add_daemon, client_keys, seconds
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("command", metavar="COMMAND", choices=tuple(COMMANDS))
     parser.add_argument("values", metavar="key=value", nargs="*", default=[])
-    add_daemon(parser, command_address, client=True)
+    add_daemon(parser, client=True)
     parser.add_argument(
         "--timeout",
         type=seconds,
@@ -55,7 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"send: {error}", file=sys.stderr)
         return 2
     try:
-        reply = send(arguments.address, request, arguments.timeout, client_keys(arguments.keys))
+        keys = client_keys(arguments.keys)
+        reply = send(arguments.address[1], request, arguments.timeout, keys)
     except (NoAnswer, KeyFileError) as error:
         print(f"send: {error}", file=sys.stderr)
         return 2

@@ -10,7 +10,7 @@ from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.errors import NoStream
 from softfinger.daemon.wire.record_text import state_parts
 from softfinger.daemon.wire.schema import HandState
-from softfinger.tools.arguments import add_daemon, no_stream, stream_address
+from softfinger.tools.arguments import add_daemon, no_stream
 from softfinger.tools.terminal.send import json_text
 
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Exit status: 0 the hand has no fault, 1 the hand has a fault, 2 no state arrived."
     )
-    add_daemon(parser, stream_address)
+    add_daemon(parser)
     parser.add_argument(
         "--json",
         action="store_true",
@@ -29,10 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the next state. Return 1 if the hand has a fault, and 2 if no state arrives."""
     try:
-        with Hand(arguments.address, keys=arguments.keys) as hand:
+        with Hand(*arguments.address, keys=arguments.keys) as hand:
             state = hand.state()
     except NoStream:
-        print(f"status: {no_stream(arguments.address, arguments.keys)}", file=sys.stderr)
+        print(f"status: {no_stream(arguments.address[0], arguments.keys)}", file=sys.stderr)
         return 2
     print(json_text(asdict(state)) if arguments.json else describe(state))
     return 1 if state.fault else 0

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from softfinger.tools.arguments import add_stream, addresses, number, seconds
+from softfinger.daemon.errors import SettingsError
+from softfinger.tools.arguments import add_stream, number, seconds
 from softfinger.tools.extras import require
 from softfinger.tools.stop_condition import StopCondition
 
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="save the recording and exit; OUT.html is a page that plays the recording without "
         "softfinger, OUT.svg is an animated picture of the hand",
     )
-    add_stream(parser, addresses)
+    add_stream(parser)
     parser.add_argument(
         "--foxglove",
         type=_any_port,
@@ -98,23 +98,19 @@ def _rate(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show the page until a stop is requested. Raises SoftfingerError if nothing can be shown."""
-    if arguments.foxglove is not None and arguments.file is not None:
-        print(
+    file, foxglove = arguments.file is not None, arguments.foxglove is not None
+    if foxglove and file:
+        raise SettingsError(
             "view: --foxglove: found FILE.mcap, but only the live stream can be served; open "
-            "the file directly in Foxglove",
-            file=sys.stderr,
+            "the file directly in Foxglove"
         )
-        return 2
-    if arguments.foxglove is not None and arguments.port is not None:
-        print(
+    if foxglove and arguments.port is not None:
+        raise SettingsError(
             "view: --port: found --foxglove, which serves the page and Foxglove on the same port; "
-            "use --foxglove PORT without --port",
-            file=sys.stderr,
+            "use --foxglove PORT without --port"
         )
-        return 2
-    if arguments.save is not None and arguments.file is None:
-        print("view: --save requires a recording: add FILE.mcap", file=sys.stderr)
-        return 2
+    if arguments.save is not None and not file:
+        raise SettingsError("view: --save requires a recording: add FILE.mcap")
     arguments.address, arguments.commands = arguments.address
     require("view")
     from softfinger.tools.viewing.page import show
