@@ -520,7 +520,7 @@ def save_grasp(path: Path) -> None:
     from softfinger.testing import VirtualHand
     from softfinger.tools.processes.compile import build_kernels, print_event
     from softfinger.tools.recordings.reader import Recording
-    from softfinger.tools.viewing.saved import save
+    from softfinger.tools.viewing.document import save
 
     with TemporaryDirectory() as folder:
         recorded = Path(folder) / "grasp.mcap"

@@ -33,9 +33,9 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
+from softfinger.tools.viewing.document import save
 from softfinger.tools.viewing.page import listen
 from softfinger.tools.viewing.pictures import COLUMNS, TOPICS, Pictures, Row
-from softfinger.tools.viewing.saved import save
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
 from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from softfinger.daemon.client.stream import read
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.wire.schema import TactileFrame
+from softfinger.daemon.types import FINGERS
+from softfinger.daemon.wire.schema import HandState, TactileFrame
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -159,8 +160,12 @@ def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
 
 
 def test_the_held_object_is_drawn_with_its_width_and_height() -> None:
-    d, theta = held()
-    outline = held_outline(HAND, Q, d, theta, WIDTH_M, 0.06)
+    fingers = {
+        name: {"contact": True, "q": q, "d": d, "theta": theta}
+        for name, q, d, theta in zip(FINGERS, Q, *held(), strict=True)
+    }
+    state = read(HandState, fingers | {"object": {"valid": True, "width": WIDTH_M}})
+    (outline,) = held_outline(HAND, state, 0.06)
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
     across = (outline - POSE[:2]) @ n
     assert [across.min(), across.max()] == pytest.approx([-0.5 * WIDTH_M, 0.5 * WIDTH_M])

@@ -23,7 +23,6 @@ from softfinger.daemon.types import FINGERS
 from softfinger.daemon.wire.schema import FingerState, HandState, TactileFrame, TrueState
 from softfinger.kinematics.hand.geometry import HandGeometry
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
-from softfinger.tools.viewing.landscape import fingers_of
 
 FloatArray = NDArray[np.float64]
 GOAL, OBJECT = "goal", "object"  # colour names in addition to the finger names
@@ -97,27 +96,26 @@ def finger_lines(
     return FingerLines(link, place([-a, a], [0.0, 0.0]), place(rim, skin), face, push)
 
 
-def held_outline(
-    hand: HandGeometry,
-    q: tuple[float, float],
-    d: FloatArray,
-    theta: FloatArray,
-    width: float,
-    height: float,
-) -> FloatArray:
-    """Return the held object's closed outline [m], shape [5, 2], starting at the left finger.
+def held_outline(hand: HandGeometry, state: HandState, height: float) -> list[FloatArray]:
+    """Return a list with the held object's closed outline ([5, 2] in m), or an empty list.
 
-    The joint angles and contacts determine the object's position perpendicular to its faces. Along
-    the faces, the object is assumed to be centred on the contacts.
+    The outline starts at the left finger. The joint angles and contacts determine the object's
+    position perpendicular to its faces. Along the faces, the object is assumed to be centred on the
+    contacts.
     """
-    a, tips = hand.tip_radius, hand.tips(q)
+    fingers = state.left, state.right
+    if not state.object.valid or not all(map(touches, fingers)):
+        return []
+    q, d, theta = ([getattr(each, key) for each in fingers] for key in ("q", "d", "theta"))
+    a, tips = hand.tip_radius, hand.tips((q[0], q[1]))
     angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
     n = np.array([math.cos(angle), math.sin(angle)])
     t = np.array([-n[1], n[0]])
     across = 0.5 * (tips[0] @ n + a - d[0] + tips[1] @ n - a + d[1])
-    corners = 0.5 * np.array([(-1, -1), (-1, 1), (1, 1), (1, -1), (-1, -1)]) * (width, height)
-    outline: FloatArray = across * n + (tips @ t).mean() * t + corners @ np.array([n, t])
-    return outline
+    size = state.object.width, height
+    corners = 0.5 * np.array([(-1, -1), (-1, 1), (1, 1), (1, -1), (-1, -1)]) * size
+    outline = across * n + (tips @ t).mean() * t + corners @ np.array([n, t])
+    return [outline] if np.isfinite(outline).all() else []
 
 
 def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
@@ -143,31 +141,20 @@ def hand_parts(
     hand = geometry_of(settings)
     half = hand.half_separation + 0.012
     parts = {"palm": DrawnPart([(GOAL, 2.4e-3, np.array([(-half, 0.0), (half, 0.0)]))], [])}
-    for name in fingers_of(settings):
-        parts[name] = _finger(hand, name, state.finger(name))
-    held = _held(hand, state, settings.simulation.object_height)
+    for k in settings.scene.indices:
+        parts[FINGERS[k]] = _finger(hand, k, state.finger(FINGERS[k]))
+    held = held_outline(hand, state, settings.simulation.object_height)
     parts["object"] = DrawnPart([(OBJECT, 1.4e-3, outline) for outline in held], [])
     true = [] if truth is None else _true_outline(settings, truth)
     parts["simulated"] = DrawnPart([(GOAL, 0.6e-3, outline) for outline in true], [])
     return parts
 
 
-def _held(hand: HandGeometry, state: HandState, height: float) -> list[FloatArray]:
-    """Return a list with the object's outline, or an empty list if a tip has no contact."""
-    tips = state.left, state.right
-    if not state.object.valid or not all(map(touches, tips)):
-        return []
-    d, theta = (np.array([getattr(tip, key) for tip in tips]) for key in ("d", "theta"))
-    q = state.left.q, state.right.q
-    outline = held_outline(hand, q, d, theta, state.object.width, height)
-    return [outline] if np.isfinite(outline).all() else []
-
-
-def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
+def _finger(hand: HandGeometry, finger: int, state: FingerState) -> DrawnPart:
     """Draw one finger with its tip, the contact line on the face and the force arrow."""
     contact = (state.d, state.theta) if touches(state) else ()
-    q = state.q if math.isfinite(state.q) else 0.0
-    link, base, skin, face, push = finger_lines(hand, FINGERS.index(name), q, *contact)
+    q, name = state.q if math.isfinite(state.q) else 0.0, FINGERS[finger]
+    link, base, skin, face, push = finger_lines(hand, finger, q, *contact)
     part = DrawnPart([(name, 5.2e-3, link), (name, 2.4e-3, base), (name, 1e-3, skin)], [])
     if face is not None and push is not None:
         force = state.force if math.isfinite(state.force) else 0.0
@@ -175,7 +162,7 @@ def _finger(hand: HandGeometry, name: str, state: FingerState) -> DrawnPart:
         end, back, aside = at + way, -0.2 * way, 0.12 * np.array([way[1], -way[0]])
         arrow = np.array([at, end, end + back + aside, end, end + back - aside])
         part.lines.extend([(OBJECT, 2e-3, face), (name, 1.8e-3, arrow)])
-        outwards = -0.028 if name == FINGERS[0] else 0.028
+        outwards = -0.028 if finger == 0 else 0.028
         part.texts.append((name, link[2] + (outwards, 0.012), f"{force:.1f} N"))
     return part
 

@@ -17,7 +17,6 @@ from pydantic import ValidationError
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.profile.factory import make_material, make_tip
 from softfinger.daemon.profile.settings import Settings
-from softfinger.daemon.types import FINGERS
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.contact.table_record import TableError
 from softfinger.tools.terminal import heatmap
@@ -56,11 +55,6 @@ def landscape(settings: Settings) -> Landscape | None:
     levels = heatmap.levels_of(np.cbrt(np.asarray(contact.energy) / highest), 1.0)
     levels = np.where(contact.inside, levels, heatmap.LEVELS)
     return Landscape(levels.astype(np.uint8), d_end, highest)
-
-
-def fingers_of(settings: Settings) -> list[str]:
-    """Return the names of the hand's fingers, left finger first."""
-    return [name for name in FINGERS if name in settings.scene.fingers]
 
 
 def read_settings(message: dict[str, Any]) -> tuple[Settings, list[str]]:

@@ -39,10 +39,9 @@ from softfinger.tools.processes.compile import build_kernels
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.terminal.stream_state import judge
-from softfinger.tools.viewing.document import document
+from softfinger.tools.viewing.document import document, save
 from softfinger.tools.viewing.foxglove_server import LAYOUT, ORIGINS, PROTOCOLS, Foxglove
 from softfinger.tools.viewing.pictures import Pictures, Row
-from softfinger.tools.viewing.saved import save
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 
 if TYPE_CHECKING:
@@ -87,17 +86,17 @@ class Site:
         send: Callable[[dict[str, Any], float], dict[str, Any]] | None,
         foxglove: Foxglove | None,
         stale: float,
-        announce: Callable[[str], None] | None,
+        public: str,
     ) -> None:
         """Create a server; `run` serves the pages.
 
         A command is dropped if the user's picture is older than ``stale`` [s]. If other machines
-        can reach the page, ``announce`` is called with each one-time code.
+        can reach the page, ``public`` is its address, which is printed with each one-time code.
         """
         self._loop = loop
         self._token = token
         self._code = ""  # one-time code for one browser
-        self._announce = announce
+        self._public = public
         self._send = send
         self._stale = stale
         self._ended = asyncio.Event()
@@ -120,10 +119,10 @@ class Site:
         self._loop.call_soon_threadsafe(self._give, (scene, picture, rows))
 
     def announce(self) -> None:
-        """If codes are used, create and announce a new one-time code."""
-        if self._announce is not None:
-            self._code = secrets.token_urlsafe(8)
-            self._announce(self._code)
+        """Print the page's address with a new one-time code."""
+        self._code = secrets.token_urlsafe(8)
+        where = f"http://{self._public}/?code={self._code}"
+        print(f"view: {where} to view the hand in one browser", flush=True)
 
     def end(self) -> None:
         """End `run`. Called from another thread."""
@@ -168,7 +167,7 @@ class Site:
             known += [[origin] for origin in ORIGINS]
         here = len(hosts) == 1 and hosts[0] in self._hosts
         # If codes are used, each request contains a secret, so any host name is accepted.
-        if self._announce is not None:
+        if self._public:
             here = True
             if not self._allows(request):
                 return self._exchange(connection, request)
@@ -378,13 +377,7 @@ def show(arguments: argparse.Namespace, ending: StopCondition) -> None:
     port = arguments.port if foxglove is None else arguments.foxglove
     with listen(arguments.host, port) as listener:
         address = _address(listener)
-
-        def announce(code: str) -> None:
-            print(
-                f"view: http://{address}/?code={code} to view the hand in one browser", flush=True
-            )
-
-        site = Site(loop, token, hand_on, foxglove, arguments.timeout, announce if away else None)
+        site = Site(loop, token, hand_on, foxglove, arguments.timeout, address if away else "")
         period = 1.0 / arguments.rate
         pictures = Pictures(
             site.publish,

@@ -33,7 +33,7 @@ from softfinger.tools.terminal.stream_state import INVALID, StreamState, number,
 from softfinger.tools.terminal.text_layout import format_value
 from softfinger.tools.viewing import hand_drawing
 from softfinger.tools.viewing.hand_drawing import GOAL, OBJECT, FloatArray, touches
-from softfinger.tools.viewing.landscape import THETA_END, fingers_of, landscape, read_settings
+from softfinger.tools.viewing.landscape import THETA_END, landscape, read_settings
 
 if TYPE_CHECKING:
     from softfinger.tools.viewing.foxglove_server import Foxglove
@@ -204,7 +204,8 @@ class Pictures:
 
     def _read_settings(self, settings: Settings) -> None:
         """Lay out the scene; only parts that the hand has get panels and plots."""
-        self._settings, self._fingers = settings, fingers_of(settings)
+        self._settings = settings
+        self._fingers = [FINGERS[k] for k in settings.scene.indices]
         self._pressure = heatmap.FullScale(
             heatmap.round_up(_FULL_SCALE_MIN * settings.tactile.noise)
         )
