@@ -40,9 +40,9 @@ GROUPS = {  # maps each subcommand to its package in tools/ and its description
     "data": {
         "record": ("recordings", "record the running daemon's stream in an MCAP file"),
         "replay": ("recordings", "publish a recording again, or recompute it with this version"),
-        "analyse": ("analysis", "compute contact, force and energy over time from frames"),
+        "analyse": ("recordings", "compute contact, force and energy over time from frames"),
         "plot": (
-            "analysis",
+            "recordings",
             "plot a recording together with the model: forces, energy landscape, errors",
         ),
         "export": ("recordings", "export a recording's topics as CSV or Parquet"),

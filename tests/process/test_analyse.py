@@ -9,7 +9,7 @@ from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame, HandInfo, SensorInfo
 from softfinger.daemon.wire import schema
-from softfinger.tools.analysis.analyse import analyse, open_source, write_csv
+from softfinger.tools.recordings.analyse import analyse, open_source, write_csv
 from tests.harness.golden_wire import message_maker
 from tests.harness.recorded_hand import write_recording
 from tests.process.test_export import rows_of

@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 
+from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.wire import schema
 from softfinger.tools import style
-from softfinger.tools.analysis import plot
-from softfinger.tools.analysis.plot import Missing, RecordedRun
+from softfinger.tools.recordings import plot
+from softfinger.tools.recordings.plot import RecordedRun
 from softfinger.tools.recordings.reader import Recording
 from tests.harness.recorded_hand import record_hand, write_recording
 
@@ -91,7 +92,7 @@ def test_time_page_shows_every_value_and_its_goal(run):
     empty = replace(
         run, states={name: values[:0] for name, values in run.states.items()}, where=" x"
     )
-    with pytest.raises(Missing, match=r"mcap: the recording does not contain hand/state x"):
+    with pytest.raises(RecordingError, match=r"mcap: the recording does not contain hand/state x"):
         plot.PAGES["time"](empty)
 
 
@@ -144,7 +145,7 @@ def test_without_settings_no_model_is_drawn(path, tmp_path):
     write_recording(tmp_path / "bare.mcap", Recording(path).messages([schema.STATE]))
     bare = loaded(tmp_path / "bare.mcap")
     for page in ("angle", "landscape"):
-        with pytest.raises(Missing, match=r"bare\.mcap: .* does not contain hand/settings"):
+        with pytest.raises(RecordingError, match=r"bare\.mcap: .* does not contain hand/settings"):
             plot.PAGES[page](bare)
 
 

@@ -18,7 +18,7 @@ from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.profile.validation import plausibility_warnings
 from softfinger.daemon.tactile.replay import ReplayTactile
-from softfinger.tools.analysis.analyse import analyse, open_source
+from softfinger.tools.recordings.analyse import analyse, open_source
 from softfinger.tools.recordings.record import RecordingWriter
 from tests.harness.tactile import read_frames
 

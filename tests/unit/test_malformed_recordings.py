@@ -10,7 +10,7 @@ import pytest
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
-from softfinger.tools.analysis.analyse import analyse, open_source
+from softfinger.tools.recordings.analyse import analyse, open_source
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import recompute, recorded_settings
 from tests.harness.golden_wire import sample

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from softfinger.daemon.errors import RecordingError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
-from softfinger.tools.analysis.analyse import analyse, open_source
+from softfinger.tools.recordings.analyse import analyse, open_source
 from softfinger.tools.recordings.channels import topic_of
 from softfinger.tools.recordings.export import CsvTable, export
 from softfinger.tools.recordings.reader import Recording

@@ -1,4 +1,4 @@
-"""Record the stream in MCAP files, and replay and export recordings.
+"""Record the stream in MCAP files, and replay, analyse, plot and export recordings.
 
 Messages are stored as JSON with the topic's schema (`wire.schema_docs.json_schema`), so Foxglove
 and PlotJuggler can open the file. Floats are stored with all digits, and NaN is stored as null.

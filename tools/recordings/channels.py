@@ -15,7 +15,6 @@ from softfinger.daemon.wire import schema, schema_docs
 ENCODING = "json"
 SCHEMA_ENCODING = "jsonschema"
 PROFILE = "softfinger"
-LIBRARY = "softfinger"
 
 # Recorded frames and events also contain the fields that Foxglove's schemas require. If a stream
 # field has the same name as a Foxglove field, the stream field is renamed.

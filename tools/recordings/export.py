@@ -46,9 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Export the topics; return 1 if there is nothing to export.
 
-    Raises
-    ------
-    RecordingError, MissingExtra, OSError
+    Raises RecordingError, MissingExtra or OSError.
     """
     from softfinger.tools.sweep import Progress
 
@@ -171,18 +169,11 @@ def export(
 
     In all files, the first column ``t`` is the time [s] on the daemon's clock since the recording's
     first message. The other columns are the fields of the schema and any additional fields of the
-    topic's first message.
+    topic's first message. Returns the paths of the written files.
 
-    Returns
-    -------
-    Paths of the written files.
-
-    Raises
-    ------
-    OSError, MissingExtra
-    RecordingError
-        If the sizes of a sensor's frames differ, if two topics need the same file name, or if a
-        value does not have the type of its Parquet column.
+    Raises OSError and MissingExtra. Raises RecordingError if the sizes of a sensor's frames differ,
+    if two topics need the same file name, or if a value does not have the type of its Parquet
+    column.
     """
     tables: dict[bytes, Table] = {}
     grids: dict[str, tuple[list[float], list[Any]]] = {}  # scan times and frames of each finger

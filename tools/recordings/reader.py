@@ -25,7 +25,7 @@ from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import ENCODING, PROFILE, Converter, from_json, topic_of
 
 if TYPE_CHECKING:
-    from mcap.records import Statistics
+    from mcap.records import Chunk, Statistics
     from numpy.typing import NDArray
 
 __all__ = ["Recording", "read_recording"]
@@ -42,9 +42,6 @@ _FIELD_COUNT_MAX = 500  # maximum number of fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # record header with kind and content size
 _BEFORE_DATA = struct.Struct("<HIQQ")  # message header: channel, number, log time, publish time
-# Chunk header with first time, last time, size, CRC and length of the compression method's name.
-_BEFORE_CHUNK = struct.Struct("<QQQII")
-_LENGTH = struct.Struct("<Q")
 _MAGIC = b"\x89MCAP0\r\n"
 _END = struct.Struct("<BQQQI8s")  # footer and magic
 
@@ -57,10 +54,7 @@ def read_recording(path: str | Path) -> dict[str, NDArray[Any]]:
     Files written by ``softfinger export`` contain the same column ``t``.
     ``pandas.DataFrame(read_recording("run.mcap"))`` accepts the result.
 
-    Raises
-    ------
-    RecordingError
-        If the file is not a recording or does not contain states.
+    Raises RecordingError if the file is not a recording or does not contain states.
     """
     states = Recording(Path(path)).states()
     if not states["t"].size:
@@ -256,19 +250,18 @@ class Recording:
                 self._damaged(None)
 
     def _messages_in(
-        self, chunk: bytes, times: tuple[int, int]
+        self, content: bytes, times: tuple[int, int]
     ) -> Iterator[tuple[int, int, bytes]]:
         """Yield a chunk's messages, up to the first corrupted record."""
-        first, last, size, crc, length = _BEFORE_CHUNK.unpack_from(chunk)
-        self._count(size)
-        if last < times[0] or first > times[1]:
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Chunk
+
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
+        self._count(chunk.uncompressed_size)
+        if chunk.message_end_time < times[0] or chunk.message_start_time > times[1]:
             return
-        at = _BEFORE_CHUNK.size + length
-        method = chunk[at - length : at].decode("latin-1")
-        (length,) = _LENGTH.unpack_from(chunk, at)
-        at += _LENGTH.size
         try:
-            data = _unpacked(method, memoryview(chunk)[at : at + length], size, crc)
+            data = _unpacked(chunk)
             for kind, content in _records(io.BytesIO(data), (_CHANNEL, _MESSAGE)):
                 if (message := self._take_record(kind, content)) is not None:
                     yield message
@@ -439,24 +432,25 @@ def _plain(message: dict[str, Any]) -> dict[str, Any]:
     raise ValueError("a message with more fields than any topic has")
 
 
-def _unpacked(method: str, data: memoryview, size: int, crc: int) -> bytes:
+def _unpacked(chunk: Chunk) -> bytes:
     """Unpack a chunk's records. Raises ValueError for an incorrect checksum or excessive size."""
+    size, method = chunk.uncompressed_size, chunk.compression
     if size > _CHUNK_SIZE_MAX:
         raise ValueError(f"a chunk of {size >> 20} MB, which is too large")
     if method == "zstd":
         import zstandard
 
-        if zstandard.frame_content_size(data) not in (-1, size):
+        if zstandard.frame_content_size(chunk.data) not in (-1, size):
             raise ValueError("a chunk that is larger than its header states")
-        unpacked = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
     elif method == "lz4":
         import lz4.frame
 
-        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
     elif method == "":
-        unpacked = bytes(data)
+        data = chunk.data
     else:
         raise ValueError(f"a chunk compressed with {method[:20]!r}, expected zstd, lz4 or none")
-    if len(unpacked) != size or crc not in (0, zlib.crc32(unpacked)):
+    if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
         raise ValueError("a chunk that does not match its header")
-    return unpacked
+    return data

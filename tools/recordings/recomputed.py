@@ -63,11 +63,8 @@ class Comparison:
 def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
     """Return the recording's settings and its calibrations (JSON).
 
-    File paths are removed from the settings, because recordings are not trusted.
-
-    Raises
-    ------
-    RecordingError
+    File paths are removed from the settings, because recordings are not trusted. Raises
+    RecordingError.
     """
     message = next((each for _, each in recording.messages([schema.SETTINGS])), None)
     if message is None:
@@ -91,9 +88,7 @@ def recorded_settings(recording: MessageSource) -> tuple[Settings, list[str]]:
 def recorded_models(recording: MessageSource) -> tuple[FingerModel, FingerModel]:
     """Create the finger models from the recording's settings and calibrations.
 
-    Raises
-    ------
-    RecordingError, SettingsError, TactileError
+    Raises RecordingError, SettingsError or TactileError.
     """
     return _models(*recorded_settings(recording))
 
@@ -117,10 +112,7 @@ def counts_of(
 ) -> NDArray[np.uint16]:
     """Return a frame's counts.
 
-    Raises
-    ------
-    RecordingError
-        If the frame contains pressures, or if its grid does not match the settings.
+    Raises RecordingError if the frame contains pressures or does not match the settings' grid.
     """
     if message.get("unit") != "count":
         raise RecordingError(
@@ -227,11 +219,7 @@ _Tick = tuple[
 def _ticks(
     recording: Recording, used: Settings, progress: Callable[[int], None] | None
 ) -> Iterator[_Tick]:
-    """Yield all ticks.
-
-    For each tick, a recording contains first the frames and commands, then the input, then the
-    state.
-    """
+    """Yield all ticks; the file contains a tick's frames and commands, then input, then state."""
     wanted = (schema.INPUT, schema.TACTILE, schema.COMMAND, schema.STATE)
     frames: dict[tuple[int, int], Any] = {}
     commands: dict[int, list[dict[str, Any]]] = {}

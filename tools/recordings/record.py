@@ -32,7 +32,6 @@ from softfinger.tools.arguments import (
 from softfinger.tools.extras import require
 from softfinger.tools.recordings.channels import (
     ENCODING,
-    LIBRARY,
     PROFILE,
     SCHEMA_ENCODING,
     Converter,
@@ -105,7 +104,7 @@ class RecordingWriter:
         try:
             # The MCAP writer's own limit is twice the size at which `_write` ends a chunk.
             self._mcap = Writer(self._file, 2 * CHUNK_SIZE)
-            self._mcap.start(PROFILE, LIBRARY)
+            self._mcap.start(PROFILE, PROFILE)
             self._wrote()
         except OSError as error:
             raise self._failed(error) from None

@@ -180,20 +180,10 @@ class Source:
 
 
 def open_source(path: Path, settings: Settings, own: bool) -> Source:
-    """Open a file that contains frames.
+    """Open a file that contains frames. Raises RecordingError, SettingsError or TactileError.
 
-    Parameters
-    ----------
-    own
-        If True, use the settings in a stream recording instead of ``settings``. For a file with
-        only frames, ``own`` must be False. A pitch in this file overrides the pitch in
-        ``settings``.
-
-    Raises
-    ------
-    RecordingError
-        If the file is invalid; the message contains the file name.
-    SettingsError, TactileError
+    If ``own`` is True, the settings in a stream recording replace ``settings``. For a file with
+    only frames, ``own`` must be False, and a pitch in this file replaces the pitch in ``settings``.
     """
     if path.suffix == ".mcap":
         return _stream(path, settings, own)
@@ -332,12 +322,7 @@ def analyse(source: Source, progress: OnProgress) -> list[Contacts]:
 
 
 def write_csv(path: Path, contacts: list[Contacts]) -> None:
-    """Write a header with units, then one line per frame for each sensor in turn.
-
-    Raises
-    ------
-    OSError
-    """
+    """Write a header with units, then one line per frame for each sensor. Raises OSError."""
     names = [f"{name}_{unit}" if unit else name for name, unit in COLUMNS]
     truths = sorted({name for each in contacts for name in each.truths})
     units = dict(COLUMNS)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softfinger.daemon.errors import RecordingError, SettingsError, SoftfingerError, TactileError
+from softfinger.daemon.errors import RecordingError, SettingsError, TactileError
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
 from softfinger.tools import style
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plot a recording. Raises RecordingError, Missing, MissingExtra or OSError."""
+    """Plot a recording. Raises RecordingError, MissingExtra or OSError."""
     require("plot")  # Report a missing package before reading a long recording.
     path: Path = arguments.file
     folder = arguments.out or path.with_name(path.name + ".plots")
@@ -101,10 +101,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class Missing(SoftfingerError):
-    """Error raised if the recording lacks data for a figure; the message names the missing data."""
-
-
 @dataclass(frozen=True)
 class RecordedRun:
     """All or part of a recording; ``states`` contains the arrays of `Recording.states`.
@@ -116,10 +112,10 @@ class RecordedRun:
     states: dict[str, NDArray[Any]]
     where: str = ""
 
-    def lacks(self, what: str) -> Missing:
+    def lacks(self, what: str) -> RecordingError:
         """Return the error that the recording does not contain ``what``."""
         path = self.recording.path
-        return Missing(f"{path}: the recording does not contain {what}{self.where}")
+        return RecordingError(f"{path}: the recording does not contain {what}{self.where}")
 
     @property
     def t(self) -> FloatArray:
@@ -138,19 +134,17 @@ class RecordedRun:
 
     @cached_property
     def models(self) -> tuple[FingerModel, FingerModel]:
-        """Finger models of the recorded settings. Raises Missing if the models can't be built."""
+        """Finger models of the recorded settings. Raises RecordingError."""
         try:
             return recorded_models(self.recording)
-        except RecordingError as error:
-            raise Missing(str(error)) from None
         except (SettingsError, TactileError, ValueError) as error:
-            raise Missing(
+            raise RecordingError(
                 f"{self.recording.path}: can't build the contact model from the recorded "
                 f"settings: {error}"
             ) from None
 
     def contacts(self) -> dict[str, ContactTable]:
-        """Return the table of each finger with a contact; raise Missing if there is no contact."""
+        """Return the table of each touching finger. Raises RecordingError if there is none."""
         if not self.t.size:
             raise self.lacks("hand/state")
         touched = [name for name in self.fingers if self.touching(name).any()]
