@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -116,22 +117,17 @@ class Sweep(Generic[Case, Result]):
     def run(self, processes: int | None = None, scheduler: str | None = None) -> Iterator[Result]:
         """Run the sweep and yield each result as soon as possible, in the order of the cases.
 
-        Raises
-        ------
-        SweepError
-            If the scheduler does not respond, workers die repeatedly, or the journal belongs to
-            another sweep.
-        MissingExtra
-            If a scheduler is given and Dask is not installed.
+        Raises SweepError if the scheduler does not respond, workers die repeatedly, or the journal
+        belongs to another sweep. Raises MissingExtra if Dask is required but not installed.
         """
         self._take_up()
         processes = processes or processors()
         with Progress(self._name, len(self._cases)) as progress:
             began, before, yielded = time.monotonic(), len(self._results), 0
             for done in self._done(processes, scheduler):
-                left = len(self._cases) - done
                 each = (time.monotonic() - began) / max(done - before, 1)
-                progress(done, f"{done}/{len(self._cases)}, {_format_duration(left * each)} left")
+                left = timedelta(seconds=round((len(self._cases) - done) * each))
+                progress(done, f"{done}/{len(self._cases)}, {left} left")
                 while yielded in self._results:
                     yield self._results[yielded]
                     yielded += 1
@@ -256,8 +252,3 @@ def _cluster(address: str) -> Iterator[Executor]:
         raise SweepError(f"--scheduler {address}: no Dask scheduler responds: {error}") from None
     with client:
         yield client.get_executor()
-
-
-def _format_duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

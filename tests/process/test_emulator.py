@@ -151,7 +151,7 @@ def test_links_that_were_redirected_are_not_removed(tmp_path):
         (["--fault", "lose=2"], 1, "found 2, expected 0 to 1 (probability)"),
         (["--fault", "delay=2"], 1, "found 2, expected 0 to 1 (seconds)"),
         (["--model", "AX-12"], 2, "XM430-W350"),
-        (["--baud", "1234"], 1, "baud"),
+        (["--baud", "1234"], 2, "baud"),
         (["--ids", "1"], 2, "expected two IDs between 0 and 252"),
         (["--ids", "1,253"], 2, "expected two IDs between 0 and 252"),
         (["--ids", "1,x"], 2, "expected two IDs between 0 and 252"),

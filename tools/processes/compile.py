@@ -52,9 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compile the missing kernels. Return 1 if a kernel could not be compiled or stored.
 
-    Raises
-    ------
-    SettingsError
+    Raises SettingsError.
     """
     if not build_kernels(profile(arguments), print_event, ALL if arguments.all else None):
         return 1

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from softfinger.daemon.errors import SettingsError, SoftfingerError
+from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.own_files import runtime_fault
 from softfinger.tools.arguments import add_profile, own_runtime_folder, profile
 from softfinger.tools.stop_condition import Interrupted, Signals
@@ -143,24 +143,29 @@ def _ids(text: str) -> tuple[int, ...]:
 def run(arguments: argparse.Namespace) -> int:
     """Emulate the hand until SIGINT, SIGTERM or SIGHUP arrives.
 
-    If the setup fails, print a message and return 1.
+    Raises SoftfingerError if the setup fails, or if the running emulator refuses ``--send``.
     """
     arguments.dir = arguments.dir or own_runtime_folder()
     if arguments.dir is None:
         raise SettingsError(f"{runtime_fault()}; or name another folder with --dir")
     if arguments.send is not None:
-        return _send(arguments.dir, arguments.send)
+        from softfinger.daemon.simulation.emulator.folder import carry_out
+
+        if reply := carry_out(arguments.dir, arguments.send):
+            print(reply)
+        return 0
     if arguments.model is not None:
         arguments.set = [*arguments.set, f"servos.model={arguments.model}"]
     settings = profile(arguments)
     signals = Signals()
     try:
-        return _serve(settings, arguments, signals)
+        _serve(settings, arguments, signals)
     except Interrupted:
-        return 0
+        pass
+    return 0
 
 
-def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> int:
+def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) -> None:
     # The following imports are slow (numpy, numba), so settings errors are reported first.
     from softfinger.daemon.loop.realtime import RealTime
 
@@ -172,24 +177,19 @@ def _serve(settings: Settings, arguments: argparse.Namespace, signals: Signals) 
     build_kernels(with_board(settings), print_event, EMULATED)
     with contextlib.ExitStack() as made:
         with signals.deferred():
-            try:
-                emulator = Emulator(
-                    settings,
-                    arguments.dir,
-                    baud=arguments.baud,
-                    factory=arguments.factory,
-                    ids=arguments.ids,
-                    faults=arguments.fault,
-                    tell=lambda line: print(line, file=sys.stderr, flush=True),
-                )
-            except SoftfingerError as error:
-                print(f"softfinger: {error}", file=sys.stderr)
-                return 1
+            emulator = Emulator(
+                settings,
+                arguments.dir,
+                baud=arguments.baud,
+                factory=arguments.factory,
+                ids=arguments.ids,
+                faults=arguments.fault,
+                tell=lambda line: print(line, file=sys.stderr, flush=True),
+            )
             made.callback(emulator.close)
         signals.hand_over(emulator.end)
         with RealTime(_unhurried(settings, arguments.baud > 0)):
             emulator.run(lambda: print(_ready(emulator.ports), end="", flush=True))
-    return 0
 
 
 @contextlib.contextmanager
@@ -234,16 +234,3 @@ def _unhurried(settings: Settings, paced: bool) -> Settings:
     held = paced and settings.realtime.hold_latency
     realtime = {**changes, "hold_latency": held}
     return settings.changed(realtime=realtime, loop={"clock": "real"})
-
-
-def _send(folder: Path, words: str) -> int:
-    from softfinger.daemon.simulation.emulator.folder import carry_out
-
-    try:
-        reply = carry_out(folder, words)
-    except SoftfingerError as error:
-        print(f"softfinger: {error}", file=sys.stderr)
-        return 1
-    if reply:
-        print(reply)
-    return 0

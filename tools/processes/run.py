@@ -6,7 +6,6 @@ import argparse
 import gc
 import math
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -61,16 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run until a signal arrives or ``--duration`` has elapsed.
+    """Run until a signal arrives or ``--duration`` has elapsed. Return 1 after a failure.
 
-    Returns
-    -------
-    0 on success, 1 after a failure, 2 if the settings or the log file are unusable.
-
-    Raises
-    ------
-    SettingsError
-        The message reports all errors.
+    Raises SettingsError if the settings or the log file are unusable.
     """
     settings = profile(arguments)
     if arguments.no_task:
@@ -80,8 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         log = EventLog(arguments.log, arguments.log_file)
     except OSError as error:
-        print(f"softfinger: --log-file {arguments.log_file}: {error.strerror}", file=sys.stderr)
-        return 2
+        raise SettingsError(f"run: --log-file {arguments.log_file}: {error.strerror}") from None
     log.take_over_logging()
     try:
         return _serve(settings, arguments, signals, log)

@@ -98,11 +98,7 @@ def _picture(text: str) -> Path:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate all grasps, print the map and write the requested files.
 
-    Raises
-    ------
-    SettingsError, SweepError, OSError
-    MissingExtra
-        If matplotlib or Dask is needed but not installed.
+    Raises SettingsError, SweepError, MissingExtra or OSError.
     """
     settings = profile(arguments)
     if arguments.plot:

@@ -21,6 +21,7 @@ import zmq
 
 from softfinger.daemon.client.connection import subscribe
 from softfinger.daemon.control.modes import GRIPPING_MODES
+from softfinger.daemon.errors import SoftfingerError
 from softfinger.tools.arguments import (
     WAIT_MAX,
     add_stream,
@@ -151,7 +152,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until q is pressed, a signal arrives, the duration has elapsed or the daemon exits.
 
-    Returns 1 if no stream was received. Raises KeyFileError.
+    Returns 1 if no stream was received. Raises SoftfingerError.
     """
     state, commands = args.address
     if args.lifeline is not None:
@@ -171,8 +172,7 @@ def run(args: argparse.Namespace) -> int:
             else:
                 _run_plain(state, feed, socket, ending)
     except zmq.ZMQError as error:
-        to_stderr("monitor")(f"{state}, {commands}: {error}")
-        return 1
+        raise SoftfingerError(f"{state}, {commands}: {error}") from None
     finally:
         context.destroy(linger=0)
     if ending.why:
@@ -305,32 +305,18 @@ def _read(keyboard: int) -> bytes:
 def _run_plain(
     address: str, feed: StreamState, socket: zmq.Socket[Any], ending: _MonitorStop
 ) -> None:
-    with contextlib.suppress(BrokenPipeError):
-        said_status, due = "live", 0.0
-        while not ending.is_met:
-            ending.wait(PLAIN_READ_INTERVAL)
-            now = time.monotonic()
-            feed.drain(socket, now)
-            ending.watch(feed, address, now)
-            status = feed.status(now)
-            if status != said_status:
-                said_status = status
-                _say(f"{_clock()} stream {status}: {address}")
-            for event in feed.news():
-                _say(f"{event.clock()} {event.level} {event.kind}: {event.text}")
-            if status in ("live", "stale") and now >= due:
-                due = now + PLAIN_LINE_INTERVAL
-                _say(f"{_clock()} {printable(describe(feed.state))}")
-        return
-    # The reader has closed the pipe. Python flushes standard output again at exit, so redirect it
-    # to /dev/null.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _clock() -> str:
-    return time.strftime("%H:%M:%S")
-
-
-def _say(line: str) -> None:
-    data = f"{line}\n".encode(sys.stdout.encoding or "utf-8", "replace")
-    os.write(sys.stdout.fileno(), data)
+    shown_status, due = "live", 0.0
+    while not ending.is_met:
+        ending.wait(PLAIN_READ_INTERVAL)
+        now, clock = time.monotonic(), time.strftime("%H:%M:%S")
+        feed.drain(socket, now)
+        ending.watch(feed, address, now)
+        status = feed.status(now)
+        if status != shown_status:
+            shown_status = status
+            print(f"{clock} stream {status}: {address}", flush=True)
+        for event in feed.news():
+            print(f"{event.clock()} {event.level} {event.kind}: {event.text}", flush=True)
+        if status in ("live", "stale") and now >= due:
+            due = now + PLAIN_LINE_INTERVAL
+            print(f"{clock} {printable(describe(feed.state))}", flush=True)
