@@ -172,25 +172,20 @@ def export(
     topic's first message. Returns the paths of the written files.
 
     Raises OSError and MissingExtra. Raises RecordingError if the sizes of a sensor's frames differ,
-    if two topics need the same file name, or if a value does not have the type of its Parquet
-    column.
+    or if a value does not have the type of its Parquet column.
     """
-    tables: dict[bytes, Table] = {}
+    tables: dict[str, Table] = {}
     grids: dict[str, tuple[list[float], list[Any]]] = {}  # scan times and frames of each finger
     files: list[Path] = []
     with contextlib.ExitStack() as opened:
         for topic, message in recording.messages(topics, start, end, progress):
             t = recording.time(message)
             row = {"t": t} | flat(message)
-            if topic not in tables:
-                name = _file_name(topic)
-                if any(each.stem == name for each in files):
-                    raise RecordingError(
-                        f"{recording.path}: two topics would be written to the same file {name}"
-                    )
+            name = _file_name(topic)
+            if name not in tables:
                 files.append(folder / f"{name}{kind.suffix}")
-                tables[topic] = kind(files[-1], _columns(topic, row))
-                opened.callback(tables[topic].close)
+                tables[name] = kind(files[-1], _columns(topic, row))
+                opened.callback(tables[name].close)
             if topic == schema.TACTILE:
                 times, frames = grids.setdefault(message["finger"], ([], []))
                 shape = message["rows"], message["cols"]
@@ -203,7 +198,7 @@ def export(
                     )
                 times.append(t)
                 frames.append(np.frombuffer(message["data"], "<u2").reshape(shape))
-            tables[topic].add(row)
+            tables[name].add(row)
     for finger, (times, frames) in sorted(grids.items()):
         files.append(folder / f"tactile-{finger}.npz")
         with write_bytes(files[-1]) as packed:

@@ -31,13 +31,14 @@ if TYPE_CHECKING:
 __all__ = ["Recording", "read_recording"]
 
 _MESSAGE_SIZE_MAX = 1 << 20  # maximum message size [bytes]; the largest frame has 0.2 MB
-_SETTINGS_SIZE_MAX = 4 << 20  # maximum settings size [bytes], including per-cell calibrations
+# Settings include per-cell calibrations [bytes].
+_SIZES_MAX = {schema.SETTINGS: 4 << 20}
 _CHUNK_SIZE_MAX = 64 << 20  # maximum unpacked chunk size [bytes]; chunks usually take 1 to 8 MB
 # Reading even a short record takes time, so each channel or message counts as at least this number
 # of bytes.
 _RECORD_SIZE_MIN = 512
 _CHANNEL_COUNT_MAX = 64
-_OTHERS_NAMED_MAX = 3  # maximum number of foreign channels that a warning lists
+_OTHERS_NAMED_MAX = 3  # maximum number of foreign channels that a message lists
 _FIELD_COUNT_MAX = 500  # maximum number of fields per message
 _HEADER, _FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 1, 2, 4, 5, 6, 11, 15
 _RECORD = struct.Struct("<BQ")  # record header with kind and content size
@@ -114,19 +115,16 @@ class Recording:
         if self.truncated and not self.damage:
             self._damaged(None)
         if self._profile != PROFILE and not self._names:
-            names = ", ".join(sorted(self._other_names.values())[:_OTHERS_NAMED_MAX]) or "none"
             damage = f"; {self.damage}" if self.damage else ""
             raise RecordingError(
-                f"{path}: found the profile {self._profile!r} (channels: {names}), expected the "
-                f"profile {PROFILE!r} or channels of this stream, such as hand/state in "
-                f"JSON{damage}"
+                f"{path}: found the profile {self._profile!r} (channels: "
+                f"{_listed(sorted(self._other_names.values()))}), expected the profile {PROFILE!r} "
+                f"or channels of this stream, such as hand/state in JSON{damage}"
             )
         if self.others:
-            names = ", ".join([*self.others][:_OTHERS_NAMED_MAX])
-            more = ", …" if len(self.others) > _OTHERS_NAMED_MAX else ""
             self._say(
                 f"{path}: skipped {sum(self.others.values())} messages on {len(self.others)} "
-                f"channels from other programs ({names}{more})"
+                f"channels from other programs ({_listed([*self.others])})"
             )
 
     @property
@@ -200,9 +198,7 @@ class Recording:
                 continue
             topic, convert = selected[channel]
             try:
-                if len(data) > (
-                    _SETTINGS_SIZE_MAX if topic == schema.SETTINGS else _MESSAGE_SIZE_MAX
-                ):
+                if len(data) > _SIZES_MAX.get(topic, _MESSAGE_SIZE_MAX):
                     raise ValueError(f"a message of {len(data) >> 20} MB, which is too large")
                 message = convert(_plain(loads(data)))
             except ValueError as error:
@@ -384,6 +380,11 @@ class Recording:
         if end >= 0:
             self._first = start
             self.start, self.end = start * 1e-9, end * 1e-9
+
+
+def _listed(names: list[str]) -> str:
+    more = ", …" if len(names) > _OTHERS_NAMED_MAX else ""
+    return ", ".join(names[:_OTHERS_NAMED_MAX]) + more or "none"
 
 
 def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
