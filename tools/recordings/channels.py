@@ -80,9 +80,11 @@ def schema_of(topic: bytes) -> tuple[str, dict[str, Any]]:
     return name, described
 
 
-def to_json(topic: bytes) -> Converter:
-    """Return a function that converts a stream map to JSON; the function may modify the map."""
-    return {schema.TACTILE: _image, schema.EVENT: _log}.get(topic, lambda message: message)
+def to_json(topic: bytes, message: dict[str, Any]) -> dict[str, Any]:
+    """Convert a stream map to a channel's JSON; this function may modify ``message``."""
+    if topic == schema.TACTILE:
+        return _image(message)
+    return _log(message) if topic == schema.EVENT else message
 
 
 def from_json(topic: bytes) -> Converter:

@@ -34,7 +34,6 @@ from softfinger.tools.recordings.channels import (
     ENCODING,
     PROFILE,
     SCHEMA_ENCODING,
-    Converter,
     channel_name,
     schema_of,
     to_json,
@@ -83,9 +82,7 @@ class RecordingWriter:
         self._dumps = orjson.dumps
         self._added = 0  # number of messages, including those in the incomplete chunk
         self._filled = 0  # number of bytes in the incomplete chunk
-        # Each key is a topic or, for tactile frames, a channel name.
-        self._channels: dict[bytes | str, tuple[int, Converter]] = {}
-        self._schemas: dict[bytes, int] = {}
+        self._channels: dict[str, int] = {}  # maps channel names to channel numbers
         self._ended = False
         self._newest = math.nan  # time of the newest message [s]
         # Repeated messages that arrived before the first new message.
@@ -149,8 +146,7 @@ class RecordingWriter:
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._wrote()
             self._file.close()
-            # Free the chunk index, which occupies most of the writer's memory.
-            del self._mcap
+            del self._mcap  # The chunk index occupies most of the writer's memory.
         except OSError as error:
             raise self._failed(error) from None
 
@@ -160,33 +156,27 @@ class RecordingWriter:
             self._write(each, message, when)
 
     def _write(self, topic: bytes, message: dict[str, Any], when: float) -> None:
-        key = channel_name(topic, message) if topic == schema.TACTILE else topic
+        name = channel_name(topic, message)
+        sequence = message.get("seq")
+        sequence = sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0
         try:
-            if key not in self._channels:
-                self._channels[key] = self._open(channel_name(topic, message), topic)
-            channel, convert = self._channels[key]
+            if name not in self._channels:
+                title, fields = schema_of(topic)
+                text = json.dumps(fields, ensure_ascii=False).encode()
+                number = self._mcap.register_schema(title, SCHEMA_ENCODING, text)
+                self._channels[name] = self._mcap.register_channel(name, ENCODING, number)
             try:
-                data = self._dumps(convert(message))
+                data = self._dumps(to_json(topic, message))
             except TypeError:  # orjson raises TypeError for values that JSON cannot represent.
                 return
-            sequence = message.get("seq")
-            sequence = sequence & 0xFFFFFFFF if isinstance(sequence, int) else 0
             stamp = int(when * 1e9)
-            self._mcap.add_message(channel, stamp, data, stamp, sequence)
+            self._mcap.add_message(self._channels[name], stamp, data, stamp, sequence)
         except OSError as error:
             raise self._failed(error) from None
         self._added += 1
         self._filled += len(data)
         if self._filled > CHUNK_SIZE:
             self.flush()
-
-    def _open(self, name: str, topic: bytes) -> tuple[int, Converter]:
-        number = self._schemas.get(topic)
-        if number is None:
-            title, fields = schema_of(topic)
-            text = json.dumps(fields, ensure_ascii=False).encode()
-            number = self._schemas[topic] = self._mcap.register_schema(title, SCHEMA_ENCODING, text)
-        return self._mcap.register_channel(name, ENCODING, number), to_json(topic)
 
     def _wrote(self) -> None:
         self._file.flush()

@@ -149,7 +149,7 @@ class Foxglove:
         if not keeps and not self._wanted(channel):
             return
         try:
-            data = orjson.dumps(channels.to_json(topic)(dict(message)))  # NaN becomes null.
+            data = orjson.dumps(channels.to_json(topic, dict(message)))  # NaN becomes null.
         except TypeError:  # orjson raises TypeError for values that JSON cannot represent.
             return
         self._loop.call_soon_threadsafe(partial(self._give, channel, stamp, data, keeps))
