@@ -13,7 +13,7 @@ from softfinger.daemon.client.stream import read
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS
-from softfinger.daemon.wire.schema import HandState, TactileFrame
+from softfinger.daemon.wire.schema import FingerState, HandState, TactileFrame
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
@@ -21,7 +21,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.terminal.heatmap import LEVELS
 from softfinger.tools.viewing import pictures
 from softfinger.tools.viewing.hand_drawing import (
-    finger_lines,
+    finger_part,
     footprint,
     grid_of,
     held_outline,
@@ -135,7 +135,9 @@ def held() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 @pytest.mark.parametrize("finger", [0, 1])
 def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
     d, theta = held()
-    lines = finger_lines(HAND, finger, Q[finger], d[finger], theta[finger])
+    fields = {"contact": True, "q": Q[finger], "d": d[finger], "theta": theta[finger], "force": 8.0}
+    part = finger_part(HAND, finger, read(FingerState, fields))
+    _, base, skin, face, arrow = (points for _, _, points in part.lines)
     n = np.array([math.cos(POSE[2]), math.sin(POSE[2])])
     outwards = -n if finger == 0 else n  # outward normal of the object's face
 
@@ -143,19 +145,17 @@ def test_an_indented_tip_ends_at_the_face_of_the_object(finger: int) -> None:
         distance: NDArray[np.float64] = (points - POSE[:2]) @ outwards - 0.5 * WIDTH_M
         return distance
 
-    assert lines.face is not None
-    assert lines.push is not None
-    assert beyond(lines.face) == pytest.approx([0.0, 0.0], abs=1e-12)
-    assert beyond(lines.push[:1]) == pytest.approx([0.0], abs=1e-12)
-    assert beyond(lines.skin).min() == pytest.approx(0.0, abs=1e-6)
-    middle, out = lines.face.mean(axis=0), lines.push[1]
+    assert beyond(face) == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert beyond(arrow[:1]) == pytest.approx([0.0], abs=1e-12)
+    assert beyond(skin).min() == pytest.approx(0.0, abs=1e-6)
+    middle, out = face.mean(axis=0), (arrow[1] - arrow[0]) / np.linalg.norm(arrow[1] - arrow[0])
     centre = HAND.tips(Q)[finger]
     assert -outwards @ out == pytest.approx(math.cos(theta[finger]))
     assert (middle - centre) @ outwards == pytest.approx(-(0.02 - d[finger]))
     # The drawn force arrow starts on the face, directly above the pressure centroid on the base.
-    along = (lines.base[1] - lines.base[0]) / 0.04
+    along = (base[1] - base[0]) / 0.04
     assert -outwards @ along == pytest.approx(math.sin(theta[finger]))
-    foot = (lines.push[0] - centre) @ along
+    foot = (arrow[0] - centre) @ along
     assert foot == pytest.approx((0.02 - d[finger] / 3.0) * math.sin(theta[finger]))
 
 

@@ -50,30 +50,18 @@ class DrawnPart(NamedTuple):
     texts: list[tuple[str, FloatArray, str]]  # colour name, position [2] and text of each label
 
 
-class FingerLines(NamedTuple):
-    """Lines of one finger [m], each with shape [n, 2]."""
-
-    link: FloatArray  # pivot, link end, and centre of the tip's base
-    base: FloatArray
-    skin: FloatArray
-    face: FloatArray | None  # end points of the line along which the tip touches the object's face
-    # Point at which the tip pushes on the object, and unit vector in the push direction.
-    push: FloatArray | None
-
-
 def touches(finger: FingerState) -> bool:
     """Return True if the tip has a contact that can be drawn."""
     return finger.contact and 0.0 < finger.d < math.inf and math.isfinite(finger.theta)
 
 
-def finger_lines(
-    hand: HandGeometry, finger: int, q: float, d: float = 0.0, theta: float = 0.0
-) -> FingerLines:
-    """Return the lines of finger 0 (left) or 1 (right) at joint angle ``q`` [rad].
+def finger_part(hand: HandGeometry, finger: int, state: FingerState) -> DrawnPart:
+    """Draw finger 0 (left) or 1 (right): link, base and skin of the tip.
 
-    ``d`` [m] is 0 for a tip without contact.
+    A contact adds the line along which the tip touches the object's face, and the force arrow.
     """
-    a, side = hand.tip_radius, 1.0 if finger == 0 else -1.0
+    a, side, name = hand.tip_radius, 1.0 if finger == 0 else -1.0, FINGERS[finger]
+    q, d = state.q if math.isfinite(state.q) else 0.0, state.d
     sine, cosine = math.sin(q), math.cos(q)
     along, out = np.array([sine, side * cosine]), np.array([side * cosine, -sine])
     centre = hand.tips((q, q))[finger]
@@ -84,16 +72,24 @@ def finger_lines(
         return placed
 
     rim, skin = a * np.sin(_HALF_TURN), a * np.cos(_HALF_TURN)
-    face = push = None
-    if 0.0 < d < a and abs(theta) < 0.5 * math.pi:
-        n_x, n_z, h = math.sin(theta), math.cos(theta), a - d
+    contact: list[tuple[str, float, FloatArray]] = []
+    texts = []
+    if touches(state) and d < a and abs(state.theta) < 0.5 * math.pi:
+        n_x, n_z, h = math.sin(state.theta), math.cos(state.theta), a - d
         skin = np.clip((h - rim * n_x) / n_z, 0.0, skin)
         ends = math.sqrt(2.0 * a * d - d * d) * np.array([-1.0, 1.0])
         face = place(h * n_x + ends * n_z, h * n_z - ends * n_x)
         x = (a - d / 3.0) * n_x  # pressure centroid
-        push = np.array([place(x, (h - x * n_x) / n_z), out])
+        force = state.force if math.isfinite(state.force) else 0.0
+        at, way = place(x, (h - x * n_x) / n_z), min(_ARROW_SCALE * force, _ARROW_MAX) * out
+        end, back, aside = at + way, -0.2 * way, 0.12 * np.array([way[1], -way[0]])
+        arrow = np.array([at, end, end + back + aside, end, end + back - aside])
+        contact = [(OBJECT, 2e-3, face), (name, 1.8e-3, arrow)]
+        texts = [(name, centre + np.array([-0.028 * side, 0.012]), f"{force:.1f} N")]
     link = np.array([pivot, pivot + hand.finger_length * np.array([side * sine, cosine]), centre])
-    return FingerLines(link, place([-a, a], [0.0, 0.0]), place(rim, skin), face, push)
+    base = place([-a, a], [0.0, 0.0])
+    tip = [(name, 5.2e-3, link), (name, 2.4e-3, base), (name, 1e-3, place(rim, skin))]
+    return DrawnPart([*tip, *contact], texts)
 
 
 def held_outline(hand: HandGeometry, state: HandState, height: float) -> list[FloatArray]:
@@ -118,7 +114,7 @@ def held_outline(hand: HandGeometry, state: HandState, height: float) -> list[Fl
     return [outline] if np.isfinite(outline).all() else []
 
 
-def _true_outline(settings: Settings, truth: dict[str, Any]) -> list[FloatArray]:
+def _true_outline(settings: Settings, truth: dict[str, Any] | None) -> list[FloatArray]:
     """Return a list that contains the object's true outline ([n, 2] in m), or an empty list."""
     pose = read(TrueState, truth).true_object
     try:
@@ -142,29 +138,12 @@ def hand_parts(
     half = hand.half_separation + 0.012
     parts = {"palm": DrawnPart([(GOAL, 2.4e-3, np.array([(-half, 0.0), (half, 0.0)]))], [])}
     for k in settings.scene.indices:
-        parts[FINGERS[k]] = _finger(hand, k, state.finger(FINGERS[k]))
+        parts[FINGERS[k]] = finger_part(hand, k, state.finger(FINGERS[k]))
     held = held_outline(hand, state, settings.simulation.object_height)
     parts["object"] = DrawnPart([(OBJECT, 1.4e-3, outline) for outline in held], [])
-    true = [] if truth is None else _true_outline(settings, truth)
+    true = _true_outline(settings, truth)
     parts["simulated"] = DrawnPart([(GOAL, 0.6e-3, outline) for outline in true], [])
     return parts
-
-
-def _finger(hand: HandGeometry, finger: int, state: FingerState) -> DrawnPart:
-    """Draw one finger with its tip, the contact line on the face and the force arrow."""
-    contact = (state.d, state.theta) if touches(state) else ()
-    q, name = state.q if math.isfinite(state.q) else 0.0, FINGERS[finger]
-    link, base, skin, face, push = finger_lines(hand, finger, q, *contact)
-    part = DrawnPart([(name, 5.2e-3, link), (name, 2.4e-3, base), (name, 1e-3, skin)], [])
-    if face is not None and push is not None:
-        force = state.force if math.isfinite(state.force) else 0.0
-        at, way = push[0], min(_ARROW_SCALE * force, _ARROW_MAX) * push[1]
-        end, back, aside = at + way, -0.2 * way, 0.12 * np.array([way[1], -way[0]])
-        arrow = np.array([at, end, end + back + aside, end, end + back - aside])
-        part.lines.extend([(OBJECT, 2e-3, face), (name, 1.8e-3, arrow)])
-        outwards = -0.028 if finger == 0 else 0.028
-        part.texts.append((name, link[2] + (outwards, 0.012), f"{force:.1f} N"))
-    return part
 
 
 # Picture coordinates are in cells from the corner of the first cell. x counts columns, and y counts
