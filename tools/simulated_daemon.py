@@ -29,15 +29,6 @@ class TrueStates:
     angle: NDArray[np.float64]  # rad
     slip: NDArray[np.float64]  # maximum of |T|/μN over both tips
 
-    def since(self, index: int) -> TrueStates:
-        """Return the states from tick ``index`` onwards."""
-        return TrueStates(self.t[index:], self.force[index:], self.angle[index:], self.slip[index:])
-
-    def settled(self, off: NDArray[np.bool_]) -> float:
-        """Return the time [s] at which ``off`` was last True, measured from the first tick."""
-        where = np.flatnonzero(off)
-        return float(self.t[where[-1]] - self.t[0]) if len(where) else 0.0
-
 
 def _in_virtual_time(sections: dict[str, dict[str, Any]]) -> Settings:
     return checked(sections | {"loop": sections.get("loop", {}) | {"clock": "virtual"}})
