@@ -103,14 +103,14 @@ class MonitorPage:
         else:
             page = self._page(width, height, now, reply)
         for line in page:
-            line.truncate(width, overflow="crop", pad=True)
+            line.truncate(width, overflow="ellipsis", pad=True)
         return page
 
     def _page(self, width: int, height: int, now: float, reply: ShownReply | None) -> list[Text]:
         status = self.feed.status(now)
         maps, events = _heights(width, height)
         numbers = [
-            *(_meanings(width, maps + 2) if self.explains else self._body(width, maps, now)),
+            *(_meanings(maps + 2) if self.explains else self._body(width, maps, now)),
             rule(width, Text(self.feed.grip())),
             self._ticks(),
         ]
@@ -152,20 +152,16 @@ class MonitorPage:
             line.stylize(ALARM)
             return line
         if status == "waiting":
-            what = " waiting for a daemon; start one with: softfinger run"
-            return truncated(
-                Text(what + " (or it requires --keys)" * (not self.guarded), WARN), width
-            )
+            keys = "" if self.guarded else " (or it requires --keys)"
+            return Text(f" waiting for a daemon; start one with: softfinger run{keys}", WARN)
         if feed.state.schema != SCHEMA:
             what = f" the stream uses schema {feed.state.schema}, but this page supports schema "
             return Text(f"{what}{SCHEMA} and shows only known fields", WARN)
         lately = feed.waited(now)
         if lately > DELAY_MIN:
             what = f" this machine is busy: the simulated hand runs {lately:.2f} s behind"
-            return truncated(
-                Text(f"{what} ({format_value(feed.state.behind_s, 2)} s in total)", WARN), width
-            )
-        return truncated(Text(f" {why_invalid(feed.state)}", WARN), width)
+            return Text(f"{what} ({format_value(feed.state.behind_s, 2)} s in total)", WARN)
+        return Text(f" {why_invalid(feed.state)}", WARN)
 
     def _body(self, width: int, lines: int, now: float) -> list[Text]:
         """Draw both maps with titles and colour scales, and the numbers between the maps."""
@@ -190,7 +186,7 @@ class MonitorPage:
         """Draw a map of ``lines`` lines with its title and scale, at most ``box`` columns wide."""
         frame = self.feed.frames.get(name)
         title = Text(name.upper(), FINGER_STYLES[name])
-        picture = [Text() for _ in range(lines)]
+        picture = _filled([], lines)
         if frame is None:
             picture[lines // 2] = centred(Text("no frames", DIM), box)
             return [title, *picture, Text()]
@@ -217,8 +213,7 @@ class MonitorPage:
             rows = [Text(), *rows, Text()]
         block = [self._heads(), *rows, self._object()]
         above = (lines - len(block)) // 2
-        block = [*(Text() for _ in range(above)), *block]
-        return block + [Text() for _ in range(lines - len(block))]
+        return _filled(_filled([], above) + block, lines)
 
     def _heads(self) -> Text:
         line = Text(" " * 8)
@@ -283,22 +278,20 @@ class MonitorPage:
             full += wrapped(text, width - 2)
             text = Text()
         full = full[:count]
-        return [rule(width, title, text), *full, *self._events(width, count - len(full))]
+        return [rule(width, title, text), *full, *self._events(count - len(full))]
 
     @property
     def _way_out(self) -> str:
         """Return the command that clears a fault."""
         return "c clears it " if self.keys else "softfinger send clear "
 
-    def _events(self, width: int, count: int) -> list[Text]:
+    def _events(self, count: int) -> list[Text]:
         lines = []
         for event in self.feed.events[-count:] if count else []:
             style = _LEVELS.get(event.level, "default")
             line = Text.assemble((f" {event.clock()}", DIM), (f" {event.kind:<9} ", style))
-            lines.append(
-                truncated(line.append(event.text, style if event.level != "info" else ""), width)
-            )
-        return lines + [Text() for _ in range(count - len(lines))]
+            lines.append(line.append(event.text, style if event.level != "info" else ""))
+        return _filled(lines, count)
 
     def _footer(self, width: int) -> Text:
         """List the keys; a narrow terminal shows only keys that are useful in the current mode."""
@@ -314,12 +307,16 @@ class MonitorPage:
         return line
 
 
-def _meanings(width: int, lines: int) -> list[Text]:
+def _filled(lines: list[Text], count: int) -> list[Text]:
+    """Add empty lines up to ``count`` lines."""
+    return lines + [Text() for _ in range(count - len(lines))]
+
+
+def _meanings(count: int) -> list[Text]:
     explained = GLOSSARY + _KEYS_EXPLAINED
-    named = [
-        truncated(Text.assemble((f" {name:>15}  ", KEY), text), width) for name, text in explained
-    ]
-    return named + [Text() for _ in range(lines - len(named))]
+    return _filled(
+        [Text.assemble((f" {name:>15}  ", KEY), text) for name, text in explained], count
+    )
 
 
 def _named(keys: dict[str, str]) -> Text:
@@ -344,6 +341,6 @@ def _too_small(width: int, height: int) -> list[Text]:
         f"this terminal: {width} × {height}",
         "q quits, space stops",
     ]
-    lines = [Text() for _ in range(max(0, (height - len(text)) // 2))]
-    lines += [centred(truncated(Text(line, WARN), width), width) for line in text]
-    return (lines + [Text() for _ in range(height)])[:height]
+    lines = _filled([], (height - len(text)) // 2)
+    lines += [centred(Text(line, WARN), width) for line in text]
+    return _filled(lines, height)[:height]

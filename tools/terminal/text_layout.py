@@ -49,7 +49,7 @@ def justified(left: Text, right: Text, width: int) -> Text:
 
 def centred(line: Text, width: int) -> Text:
     """Centre ``line`` in ``width`` columns, without trailing blanks."""
-    line.pad_left((width - line.cell_len) // 2)
+    line.pad_left(max(0, (width - line.cell_len) // 2))
     return line
 
 
