@@ -50,7 +50,7 @@ def test_the_closest_subcommand_is_suggested(inline):
     [
         ("grasp force=5deg", "force=5deg: found the unit 'deg', expected N or mN"),
         ("rotate angle=8N", "angle=8N: found the unit 'N', expected rad or deg or °"),
-        ("grasp force=5 mm", "force=5 mm: found the unit 'mm', expected N or mN"),
+        ("grasp force=5mm", "force=5mm: found the unit 'mm', expected N or mN"),
         ("grasp force=nan", "found 'force=nan', expected key=number"),
         ("grasp 5", "found '5', expected key=number"),
         ("gasp", "unknown word 'gasp'; nearest: grasp"),
@@ -67,7 +67,7 @@ def test_invalid_numbers_are_not_sent(inline, words, said):
     ("words", "numbers"),
     [
         (["angle=8°"], {"angle": math.radians(8)}),
-        (["angle=-8", "deg", "force=10N"], {"angle": math.radians(-8), "force": 10.0}),
+        (["angle=-8deg", "force=10N"], {"angle": math.radians(-8), "force": 10.0}),
         (["left=0.1 rad", "right=1e-1"], {"left": 0.1, "right": 0.1}),
         (["force=2500mN"], {"force": 2.5}),
     ],

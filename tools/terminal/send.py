@@ -7,16 +7,15 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 from softfinger.daemon.client.command_client import UNCONFIRMED_TEXT, NoAnswer, send
 from softfinger.daemon.client.connection import REPLY_TIMEOUT
 from softfinger.daemon.control.modes import COMMANDS
-from softfinger.daemon.errors import KeyFileError
+from softfinger.daemon.errors import KeyFileError, SettingsError
 from softfinger.tools.arguments import add_daemon, client_keys, seconds
 
-_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
+_PAIR = re.compile(r"(\w+)=\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 _ANGLES = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0)}
 _UNITS = {  # accepted units for each key; numbers without a unit are in SI units
     "force": {"N": 1.0, "mN": 1e-3},
@@ -49,11 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     request: dict[str, Any] = {"command": arguments.command}
     if arguments.client:
         request["client"] = arguments.client
-    try:
-        request |= si_numbers(arguments.values)
-    except ValueError as error:
-        print(f"send: {error}", file=sys.stderr)
-        return 2
+    request |= si_numbers(arguments.values)
     try:
         keys = client_keys(arguments.keys)
         reply = send(arguments.address[1], request, arguments.timeout, keys)
@@ -81,26 +76,16 @@ def json_text(record: dict[str, Any]) -> str:
 
 
 def si_numbers(words: list[str]) -> dict[str, float]:
-    """Parse ``key=value`` words, and convert the values to SI units.
-
-    Raises ValueError with the invalid word and the reason.
-    """
+    """Parse ``key=value`` words, and convert the values to SI units. Raises SettingsError."""
     numbers = {}
-    for key, text in _pairs(words):
-        found = _NUMBER.fullmatch(text)
-        if not key or found is None:
-            raise ValueError(f"found {key + text!r}, expected key=number")
-        unit, known = found[2], _UNITS.get(key.removesuffix("="), {})
+    for word in words:
+        found = _PAIR.fullmatch(word)
+        if found is None:
+            raise SettingsError(f"send: found {word!r}, expected key=number")
+        key, value, unit = found.groups()
+        known = _UNITS.get(key, {})
         if unit and unit not in known:
             expected = " or ".join(known) or "a number without unit"
-            raise ValueError(f"{key + text}: found the unit {unit!r}, expected {expected}")
-        numbers[key.removesuffix("=")] = float(found[1]) * known.get(unit, 1.0)
+            raise SettingsError(f"send: {word}: found the unit {unit!r}, expected {expected}")
+        numbers[key] = float(value) * known.get(unit, 1.0)
     return numbers
-
-
-def _pairs(words: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield keys and values. A unit may be a separate word, as in ``angle=8 deg``."""
-    text = " ".join(words)
-    for pair in re.split(r"\s+(?=\S+=)", text) if words else ():
-        key, equals, value = pair.partition("=")
-        yield (key + equals, value) if equals else ("", pair)
