@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from datetime import timedelta
@@ -157,21 +157,10 @@ class Sweep(Generic[Case, Result]):
                     ) from None
 
     def _by(self, executor: Executor) -> Iterator[int]:
-        futures: dict[Future[Result], int] = {
-            executor.submit(self._work, self._cases[k]): k for k in self._left()
-        }
-        waiting = set(futures)
-        while waiting:
-            finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            broken = None
-            for future in finished:
-                try:
-                    self._keep(futures[future], future.result())
-                except BrokenProcessPool as error:
-                    broken = error
+        futures = {executor.submit(self._work, self._cases[k]): k for k in self._left()}
+        for future in as_completed(futures):
+            self._keep(futures[future], future.result())
             yield len(self._results)
-            if broken is not None:
-                raise broken
 
     def _left(self) -> list[int]:
         return [k for k in range(len(self._cases)) if k not in self._results]

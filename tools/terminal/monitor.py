@@ -177,7 +177,7 @@ def run(args: argparse.Namespace) -> int:
         context.destroy(linger=0)
     if ending.why:
         to_stderr("monitor")(ending.why)
-    return 1 if args.no_wait and feed.age(0.0) == math.inf and ending.why else 0
+    return 1 if ending.why and feed.age(0.0) == math.inf else 0
 
 
 def _lower_priority() -> None:
