@@ -2,12 +2,14 @@
 
 import json
 import math
+import time
 from collections.abc import Sequence
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
+import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.color import ColorTriplet
@@ -19,8 +21,9 @@ from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.heatmap import picture, resample
 from softfinger.tools.terminal.monitor_page import MonitorPage
-from softfinger.tools.terminal.stream_state import ShownReply, StreamState
+from softfinger.tools.terminal.stream_state import Commander, ShownReply, StreamState
 from softfinger.tools.terminal.terminal import KeyDecoder
+from tests.conftest import until
 from tests.harness import fake_daemon
 
 
@@ -321,3 +324,27 @@ def test_row_0_is_at_the_bottom_and_column_0_on_the_left():
         "    ",
         "█   ",
     ]
+
+
+def test_a_stop_overtakes_and_discards_waiting_commands(tmp_path):
+    def received() -> tuple[list[bytes], str]:
+        assert daemon.poll(60_000)
+        *route, request = daemon.recv_multipart()
+        return route, msgpack.unpackb(request)["command"]
+
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as daemon:
+        address = f"ipc://{tmp_path}/commands"
+        daemon.bind(address)
+        commander = Commander(address)
+        for name in ("arm", "grasp"):
+            commander.send(time.monotonic(), name, name)
+        arm, name = received()
+        assert name == "arm"
+        commander.send(time.monotonic(), "stop", "stop")
+        assert received()[1] == "stop"
+        daemon.send_multipart([*arm, msgpack.packb({"ok": True})])
+        until(lambda: commander.reply is not None)
+        assert commander.reply == (commander.reply.at, True, "arm: ok")
+        commander.send(time.monotonic(), "release", "release")
+        assert received()[1] == "release"  # The grasp was discarded.
+        daemon.setsockopt(zmq.LINGER, 0)
