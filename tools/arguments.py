@@ -197,6 +197,8 @@ def add_stream(parser: argparse.ArgumentParser, client: bool = False) -> None:
         help=f"exit with an error if nothing arrives for {WAIT_MAX:g} s; `monitor` also exits "
         "when the stream ends",
     )
+    # The process exits when this pipe closes.
+    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)
     add_duration(parser)
 
 

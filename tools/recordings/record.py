@@ -210,8 +210,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "tick)",
     )
     add_split(parser)
-    # The process exits when this pipe closes.
-    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)
     parser.add_argument(
         "--recover", action="store_true", help="repair a truncated FILE instead of recording"
     )

@@ -145,8 +145,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plain", action="store_true", help="print plain lines instead of the page"
     )
-    # The process exits when this pipe closes.
-    parser.add_argument("--lifeline", type=int, help=argparse.SUPPRESS)
 
 
 def run(args: argparse.Namespace) -> int:

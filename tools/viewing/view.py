@@ -115,6 +115,6 @@ def run(arguments: argparse.Namespace) -> int:
     require("view")
     from softfinger.tools.viewing.page import show
 
-    with StopCondition(arguments.duration) as ending:
+    with StopCondition(arguments.duration, arguments.lifeline) as ending:
         show(arguments, ending)
     return 0
