@@ -249,10 +249,7 @@ class Recording:
         self, content: bytes, times: tuple[int, int]
     ) -> Iterator[tuple[int, int, bytes]]:
         """Yield a chunk's messages, up to the first corrupted record."""
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Chunk
-
-        chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
+        chunk = _parsed("Chunk", content)
         self._count(chunk.uncompressed_size)
         if chunk.message_end_time < times[0] or chunk.message_start_time > times[1]:
             return
@@ -282,10 +279,7 @@ class Recording:
             raise ValueError("the unpacked data are suspiciously large for a file of this size")
 
     def _learn(self, content: bytes) -> None:
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Channel
-
-        channel = Channel.read(ReadDataStream(io.BytesIO(content)))
+        channel = _parsed("Channel", content)
         name = channel.topic.removeprefix("/")
         known = topic_of(name) in schema.TOPICS
         # If softfinger wrote the file, an unknown topic means that a newer version wrote the file.
@@ -313,9 +307,6 @@ class Recording:
 
     def _begin(self, file: BinaryIO) -> str:
         """Check the file's end; return the header's profile, or PROFILE if there is no header."""
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Header
-
         if file.read(5) != _MAGIC[:5]:
             raise RecordingError(f"{self.path}: not an MCAP file")
         file.seek(max(0, self.size - _END.size))
@@ -324,16 +315,13 @@ class Recording:
         file.seek(len(_MAGIC))
         try:
             _, content = next(_records(file, (_HEADER,)))
-            return str(Header.read(ReadDataStream(io.BytesIO(content))).profile)
+            return str(_parsed("Header", content).profile)
         except Exception:
             self.truncated = True
             return PROFILE
 
     def _summary(self, file: BinaryIO) -> Statistics | None:
         """Return the summary's statistics, or None if statistics or channels are missing."""
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Statistics
-
         if self.truncated:
             return None
         try:
@@ -347,7 +335,7 @@ class Recording:
                 if kind == _CHANNEL:
                     self._learn(content)
                 elif kind == _STATISTICS:
-                    found = Statistics.read(ReadDataStream(io.BytesIO(content)))
+                    found = _parsed("Statistics", content)
                 else:
                     break
         except Exception as error:
@@ -413,6 +401,13 @@ def _records(file: IO[bytes], wanted: Collection[int]) -> Iterator[tuple[int, by
             raise EOFError
         file.seek(skipped, os.SEEK_CUR)
         yield kind, content
+
+
+def _parsed(kind: str, content: bytes) -> Any:
+    """Parse a record's content with the class ``kind`` of the mcap library."""
+    from mcap import data_stream, records
+
+    return getattr(records, kind).read(data_stream.ReadDataStream(io.BytesIO(content)))
 
 
 def _plain(message: dict[str, Any]) -> dict[str, Any]:

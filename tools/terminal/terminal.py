@@ -12,8 +12,7 @@ import shutil
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from rich.color import ColorSystem
-from rich.console import Console
+from rich.console import COLOR_SYSTEMS, Console
 from rich.segment import Segment
 from rich.text import Text
 
@@ -27,12 +26,6 @@ _ENTER = "\x1b[?1049h\x1b[?25l\x1b[?2004h\x1b[2J"  # alternate screen, no cursor
 # This sequence begins with CAN, which ends an incomplete escape sequence.
 LEAVE = "\x18\x1b[0m\x1b[?2004l\x1b[?25h\x1b[?1049l"
 _HOLD, _SHOW = "\x1b[?2026h", "\x1b[?2026l"  # synchronised update, if supported by the terminal
-
-_COLOUR_SYSTEMS = {
-    "truecolor": ColorSystem.TRUECOLOR,
-    "256": ColorSystem.EIGHT_BIT,
-    "standard": ColorSystem.STANDARD,
-}
 
 _ARROWS = {b"D": "left", b"C": "right"}
 _KEY = re.compile(
@@ -82,7 +75,7 @@ class Terminal:
         self._stuck = False
         self._console = Console()
         name = None if self._console.no_color else self._console.color_system
-        self._colours = _COLOUR_SYSTEMS.get(name) if name else None
+        self._colours = COLOR_SYSTEMS[name] if name else None
         self.coloured = name in ("truecolor", "256")  # A map requires more than 16 colours.
 
     def __enter__(self) -> Terminal:
