@@ -11,7 +11,7 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from softfinger.daemon.errors import SettingsError
 from softfinger.daemon.own_files import runtime_fault, runtime_folder
@@ -124,36 +124,40 @@ def to_stderr(subcommand: str) -> Callable[[str], None]:
 
 
 def number(
-    text: str, what: str, low: float, high: float = 1e9, *, includes_low: bool = False
-) -> float:
-    """Parse a number within bounds.
+    what: str,
+    low: float,
+    high: float = 1e9,
+    *,
+    includes_low: bool = False,
+    kind: Callable[[float], float] = float,
+) -> Callable[[str], Any]:
+    """Return a parser for numbers within bounds, to be used as the ``type`` of an argument.
 
-    Raises ArgumentTypeError with ``what``, the description of a valid number.
+    The parser raises ArgumentTypeError with ``what``, the description of a valid number. ``kind``
+    is int for whole numbers.
     """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (low < value <= high or (includes_low and value == low)):
-        raise argparse.ArgumentTypeError(f"expected {what}, found {text!r}")
-    return value
+
+    def parsed(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (low < value <= high or (includes_low and value == low)):
+            raise argparse.ArgumentTypeError(f"expected {what}, found {text!r}")
+        return kind(value)
+
+    return parsed
 
 
-def seconds(text: str) -> float:
-    """Parse a time above 0 s; raise ArgumentTypeError if the text is invalid."""
-    return number(text, "a time above 0 s", 0.0)
+seconds = number("a time above 0 s", 0.0)
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:
     """Add ``--from`` and ``--to``; ``start`` and ``end`` are in seconds after the first message."""
-
-    def moment(text: str) -> float:
-        return number(text, "a time of 0 s or more", 0.0, includes_low=True)
-
     whence = "seconds after the first message"
     parser.add_argument(
         "--from",
-        type=moment,
+        type=number("a time of 0 s or more", 0.0, includes_low=True),
         default=-math.inf,
         metavar="S",
         dest="start",
@@ -214,7 +218,7 @@ def add_split(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument(
         "--split-size",
-        type=lambda text: number(text, "a size above 0 MB", 0.0),
+        type=number("a size above 0 MB", 0.0),
         metavar="MB",
         help="start a new file when this size is reached",
     )

@@ -85,7 +85,7 @@ def add_sweep(parser: argparse.ArgumentParser) -> None:
     """Add ``--processes`` and ``--scheduler``."""
     parser.add_argument(
         "--processes",
-        type=lambda text: int(number(text, "1 to 1024 processes", 0, 1024)),
+        type=number("1 to 1024 processes", 0, 1024, kind=int),
         metavar="N",
         help="run the cases in N processes (default: one per processor)",
     )

@@ -168,7 +168,7 @@ def _processor() -> str:
 
 
 def _trials(text: str) -> int:
-    return int(number(text, "a whole number above 0", 1.0, includes_low=True))
+    return int(number("a whole number above 0", 1.0, includes_low=True)(text))
 
 
 def _module(name: str) -> ModuleType:

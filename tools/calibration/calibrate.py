@@ -190,7 +190,7 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
 
 
 def _frames(text: str) -> int:
-    return int(number(text, "at least one frame", 1.0, includes_low=True))
+    return int(number("at least one frame", 1.0, includes_low=True)(text))
 
 
 def calibrate_scales(arguments: argparse.Namespace, settings: Settings) -> str:

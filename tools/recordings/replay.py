@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--speed",
-        type=lambda text: number(text, "a factor above 0", 0.0),
+        type=number("a factor above 0", 0.0),
         default=1.0,
         metavar="X",
         help="publish X times as fast (default 1)",

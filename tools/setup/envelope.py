@@ -9,7 +9,6 @@ import argparse
 import itertools
 import json
 import math
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,16 +53,17 @@ class Cell(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the ``envelope`` arguments."""
     add_profile(parser)
-    force = _between("a force above 0 N", 0.0, 1e9)
+    force = number("a force above 0 N", 0.0)
     parser.add_argument(
         "--force", type=force, default=10.0, metavar="N", help="grip force (default: 10)"
     )
     parser.add_argument("--shape", choices=SHAPES, action="append", help="only these shapes")
-    for name, metavar, kind in (
-        ("--size", "MM", _between("a size of 0.2 to 10000 mm", 0.2, 1e4)),
-        ("--friction", "F", _between("a friction coefficient of 1e-5 to 1e5", 1e-5, 1e5)),
-        ("--mass", "KG", _between("a mass of 1e-5 to 1e5 kg", 1e-5, 1e5)),
+    for name, metavar, what, low, high in (
+        ("--size", "MM", "a size of 0.2 to 10000 mm", 0.2, 1e4),
+        ("--friction", "F", "a friction coefficient of 1e-5 to 1e5", 1e-5, 1e5),
+        ("--mass", "KG", "a mass of 1e-5 to 1e5 kg", 1e-5, 1e5),
     ):
+        kind = number(what, low, high, includes_low=True)
         parser.add_argument(name, type=kind, nargs="+", metavar=metavar, help="only these values")
     parser.add_argument(
         "--keep",
@@ -79,11 +79,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="plot the map to a PNG, SVG or PDF file (extra 'plot')",
     )
     add_sweep(parser)
-
-
-def _between(what: str, low: float, high: float) -> Callable[[str], float]:
-    """Return a parser for nonzero numbers from ``low`` to ``high``."""
-    return lambda text: number(text, what, low, high, includes_low=low > 0.0)
 
 
 def _picture(text: str) -> Path:

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--baud",
-        type=lambda text: int(number(text, "a baud rate of 1 or more", 1.0, includes_low=True)),
+        type=number("a baud rate of 1 or more", 1.0, includes_low=True, kind=int),
         action="append",
         metavar="N",
         help="baud rate to try; can be given several times (default: all baud rates that servos "

@@ -20,6 +20,7 @@ The server stops on Ctrl-C, or after --duration.
 From another machine, use ssh -L 9090:127.0.0.1:9090 with the printed port, or --host ADDRESS on a
 trusted network. Each address printed with --host opens the page in one browser.
 Exit status: 0 success; 1 nothing could be shown (the reason is printed)."""
+_PORT = number("a port, 0 to 65535", 0.0, 65535.0, includes_low=True, kind=int)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_stream(parser)
     parser.add_argument(
         "--foxglove",
-        type=_any_port,
+        type=_PORT,
         nargs="?",
         const=8765,
         metavar="PORT",
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--port",
-        type=_any_port,
+        type=_PORT,
         metavar="N",
         help="port of the page without --foxglove (default: 9090, or a free port)",
     )
@@ -75,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rate",
-        type=_rate,
+        type=number("0.1 to 100 Hz", 0.1, 100.0, includes_low=True),
         default=10.0,
         metavar="HZ",
         help="maximum number of pictures per second (default 10)",
@@ -86,14 +87,6 @@ def _saved(text: str) -> Path:
     if not text.endswith((".html", ".svg")):
         raise argparse.ArgumentTypeError(f"expected a name ending in .html or .svg, found {text!r}")
     return Path(text)
-
-
-def _any_port(text: str) -> int:
-    return int(number(text, "a port, 0 to 65535", 0.0, 65535.0, includes_low=True))
-
-
-def _rate(text: str) -> float:
-    return number(text, "0.1 to 100 Hz", 0.1, 100.0, includes_low=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
