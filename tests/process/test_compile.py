@@ -110,9 +110,7 @@ def test_compilation_by_plain_numba_is_explained_in_one_line(monkeypatch):
 def test_kernels_are_compiled_where_the_available_memory_is_unknown(monkeypatch):
     monkeypatch.setattr(kernels, "_available", lambda: math.inf)
     monkeypatch.setattr(kernels._Build, "_build", lambda *_: "")
-    build = kernels._Build(Settings(), [named("contact table")], lambda *_: None, False)
-    build.run()
-    assert not build.failed
+    assert kernels._Build(Settings(), [named("contact table")], lambda *_: None, False).run()
 
 
 def test_ctrl_c_ends_every_compiler_process(tmp_path):

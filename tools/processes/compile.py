@@ -96,11 +96,10 @@ def build_kernels(
     names = ", ".join(part.name for part in missing)
     tell("info", "compile", f"compiling kernels (only on the first start): {names}")
     started = time.monotonic()
-    build = _Build(settings, missing, tell, bar)
-    build.run()
-    if not build.failed:
-        tell("info", "compile", f"compiled in {time.monotonic() - started:.1f} s")
-    return not build.failed
+    if not _Build(settings, missing, tell, bar).run():
+        return False
+    tell("info", "compile", f"compiled in {time.monotonic() - started:.1f} s")
+    return True
 
 
 def _available() -> float:
@@ -124,10 +123,10 @@ class _Build:
         self._bar, self._tell = Progress("compiling kernels", self._total, bar), tell
         self._processes: list[subprocess.Popen[str]] = []
         self._own = threading.local()  # Each thread uses its own process.
-        self.failed = self._over = False
+        self._over = False
 
-    def run(self) -> None:
-        """Build all parts. If interrupted, end all processes."""
+    def run(self) -> bool:
+        """Build all parts; return True on success. If interrupted, end all processes."""
         built: dict[str, Future[str]] = {}
         jobs = max(1, int(min(processors(), len(self._missing), _available() / _MEMORY_MAX)))
         pool = ThreadPoolExecutor(jobs)
@@ -154,7 +153,7 @@ class _Build:
             if (reason := future.result()) and reason not in reasons:
                 self._tell("warning", "compile", f"{name} was not compiled ahead of time: {reason}")
             reasons.add(reason)
-        self.failed = reasons != {""}
+        return reasons == {""}
 
     def _so_far(self) -> str:
         return (
