@@ -176,7 +176,7 @@ def begin(s: SlipState, grasp: GraspState) -> None:
     s.moment = moment
     s.rotation[:] = 0.0
     s.balanced_torque = 0.0
-    s.q[:] = grasp.q
+    s.q[0], s.q[1] = grasp.q[0], grasp.q[1]
     s.holding_time = _AVERAGE_TIME
 
 
@@ -226,7 +226,8 @@ def update(
     if is_held:
         _estimate_load(s, grasp, mean(torques) - s.torque)
         s.has_turned = _has_turned(s, grasp)
-    s.rotation_seen[:] = grasp.unexplained_rotation
+    s.rotation_seen[0] = grasp.unexplained_rotation[0]
+    s.rotation_seen[1] = grasp.unexplained_rotation[1]
     s.torque = mean(torques)
     # Ignore the torques if joint friction could hide a load that is too large for the grip.
     if law.tip_friction * commanded * grasp.load_arm <= s.joint_friction:

@@ -248,7 +248,8 @@ def estimate_frame(
     estimate = state.estimate
     signal = state.signal
     _reset_results(state, scale, step, saturation)
-    cells.height[:] = cells.reach
+    for k in range(frame.shape[0]):
+        cells.height[k] = cells.reach[k]
     rejected = without_outliers(state, frame, cells.height)
     strong = False
     if state.options.is_solid and signal.is_finite:

@@ -335,7 +335,8 @@ def _finish(state: EstimatorState, model: Model, cells: Cells, iterations: int) 
     estimate = state.estimate
     options = state.options
     contact = estimate.guess
-    contact[:] = fit.contact
+    for i in range(PARAMETERS):
+        contact[i] = fit.contact[i]
     d = contact[DEPTH]
     square = contact[TILT_X] * contact[TILT_X] + contact[TILT_Y] * contact[TILT_Y]
     if options.is_solid:
@@ -379,7 +380,8 @@ def fit(
     variance = state.signal.variance
     first, last = parameters(state.options)
     fit.variance = 0.0
-    fit.contact[:] = state.estimate.guess
+    for i in range(PARAMETERS):
+        fit.contact[i] = state.estimate.guess[i]
     fit.contact[DEPTH] = min(fit.contact[DEPTH], state.options.deepest)
     before = math.inf
     halvings = 0

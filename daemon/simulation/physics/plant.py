@@ -43,6 +43,7 @@ from softfinger.daemon.simulation.physics.plant_state import (
     ALONG_THETA,
     CORNERS,
     EXTRA_ROWS,
+    LAYERS,
     NO_OBJECT,
     SHEARS,
     ExtraRow,
@@ -371,7 +372,9 @@ def step(plants: Records[Plant], tables: Records[Table], ring: Records[Sample], 
             state.velocity[2] = (script_x(plant, t + h) - script_x(plant, t)) / h
             evaluate_state(plant, data)
         plant.last_state = plant.state
-        plant.last_layers[:] = plant.layers
+        for finger in range(2):
+            for k in range(LAYERS):
+                plant.last_layers[finger, k] = plant.layers[finger, k]
         was_on_rim = is_on_rim(plant)
         set_motor_slopes(plant, g)
         factorise(plant, g)
