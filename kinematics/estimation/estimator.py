@@ -22,7 +22,7 @@ from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budge
 from softfinger.kinematics.estimation.frame_pipeline import D_MAX, estimate_frame
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.estimation.moments import tabulate_moments
-from softfinger.kinematics.estimation.state import PATTERN, REACH, ROWS, SHEAR_X, EstimatorState, Y
+from softfinger.kinematics.estimation.state import SHEAR_X, EstimatorState, new_cells
 from softfinger.kinematics.sensing.footprint import Grid, axes
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.kinematics.sensing.solid_pressure import Weights, pixels_of, weights_of
@@ -349,42 +349,43 @@ class ContactEstimator:
     def _lay_out(self, tip: Fingertip, material: Material, alive: NDArray[np.bool_]) -> None:
         """Set up the model, the cell arrays, and the window of cells that a contact can press."""
         grid, state, options = self.grid, self.state, self.state.options
-        reach = cell_centres(grid.on(tip), alive, tip.radius + 3.0 * grid.blur)[0] >= 0.0
+        radius = tip.radius + 3.0 * grid.blur
+        reach = cell_centres(grid.on(tip), alive, radius)[0] >= 0.0
         rows, cols = (np.flatnonzero(reach.reshape(grid.shape).any(axis=k)) for k in (1, 0))
         self._window = slice(0, 0), slice(0, 0)
         if len(rows):
             self._window = slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
         alive = alive[self._window]
-        cells = grid.on(tip)
-        cells.x += cells.pitch_x * self._window[1].start
-        cells.y += cells.pitch_y * self._window[0].start
-        cells.rows, cells.cols = alive.shape
-        state.grid.assign(cells)
+        window = grid.on(tip)
+        window.x += window.pitch_x * self._window[1].start
+        window.y += window.pitch_y * self._window[0].start
+        window.rows, window.cols = alive.shape
+        state.grid.assign(window)
         self._frame = np.zeros(alive.shape)
         self._flat = self._frame.reshape(-1)
-        self._rows = np.zeros((ROWS, alive.size))
-        self._rows[REACH : Y + 1] = cell_centres(cells, alive, tip.radius + 3.0 * grid.blur)
-        options.number = int(np.count_nonzero(self._rows[REACH] >= 0.0))
+        cells = self._cells = new_cells(*alive.shape)
+        cells.reach[:], cells.x[:], cells.y[:] = cell_centres(window, alive, radius)
+        options.number = int(np.count_nonzero(cells.reach >= 0.0))
         pixels, weights = np.zeros((0, 0)), Weights()
         if options.is_solid:
             images = grid.images(tip).reshape(-1, *grid.shape)[:, *self._window]
             images = images.reshape(-1, alive.size)
-            pixels, self._rows[SHEAR_X:REACH] = pixels_of(images[:-2]), images[-2:]
+            pixels, cells.sensitivity[SHEAR_X:] = pixels_of(images[:-2]), images[-2:]
             weights = weights_of(tip, material)
             options.deepest, options.sine_max = weights.table.deepest, math.sin(weights.table.tilt)
         else:
             options.deepest, options.sine_max = _DEEPEST * tip.radius, _SINE_MAX
         fineness = _FINENESS_LINEAR if material.is_linear else _FINENESS_NONLINEAR
-        points = points_of(cells, material, grid.blur, count_for(cells, fineness))
+        points = points_of(window, material, grid.blur, count_for(window, fineness))
         # Arguments of the kernel, except the state and the frame.
-        self._arrays = self._rows, pixels, weights.array, *points
+        self._arrays = cells, points, pixels, weights.array
 
     def _pattern(self, tip: Fingertip, alive: NDArray[np.bool_]) -> FloatArray:
         """Compute, store and return a solid tip's contact pattern [rows, cols]."""
         pattern = self.grid.images(tip)[0].reshape(self.grid.shape) * alive
         pattern = np.where(alive, pattern - pattern.sum() / alive.sum(), 0.0)
         pattern /= math.sqrt((pattern**2).sum())
-        self._rows[PATTERN] = pattern[self._window].ravel()
+        self._cells.pattern[:] = pattern[self._window].ravel()
         return np.asarray(pattern)
 
     def _smallest_detectable_d(self, tip: Fingertip, material: Material) -> float:

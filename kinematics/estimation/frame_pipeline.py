@@ -28,7 +28,6 @@ from softfinger.kinematics.estimation.state import (
     Cells,
     EstimatorState,
     Model,
-    cells_in,
 )
 from softfinger.kinematics.sensing.solid_pressure import Weights
 from softfinger.kinematics.sensing.springs_pressure import SpringPoints
@@ -230,20 +229,16 @@ def _reset_results(state: EstimatorState, scale: float, step: float, saturation:
 @kernel
 def estimate_frame(
     states: Records[EstimatorState], frame: FloatArray, scale: float, step: float,
-    saturation: float, rows: FloatArray, pixels: FloatArray, weights: Records[Weights],
-    line: FloatArray, inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray,
-    law: FloatArray, sums: FloatArray,
+    saturation: float, cells: Cells, points: SpringPoints, pixels: FloatArray,
+    weights: Records[Weights],
 ) -> None:  # fmt: skip
     """Estimate the contact in one frame and store the result in the state (compiled entry point).
 
     ``frame`` [cells] is float64 in counts, and ``scale`` is in Pa per count. ``step`` is the size
-    of a quantum [Pa], or 0. Cells saturate at ``saturation`` counts. ``rows`` stores the
-    `state.Cells`. ``pixels`` and ``weights`` are the images of a solid tip. The remaining arguments
-    are the `SpringPoints` of a spring tip.
+    of a quantum [Pa], or 0. Cells saturate at ``saturation`` counts. ``points`` is the model of a
+    spring tip. ``pixels`` and ``weights`` are the images of a solid tip.
     """
     state = states[0]
-    cells = cells_in(rows, state.grid)
-    points = SpringPoints(line, inverse, y, across, along, law, sums)
     model = Model(points, pixels, weights[0])
     estimate = state.estimate
     signal = state.signal

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple, TypeAlias
 
-from softfinger.kinematics.compiled.kernel import inner_kernel
+import numpy as np
+
 from softfinger.kinematics.compiled.layout import FloatArray, Record
 from softfinger.kinematics.sensing.footprint import Face, Grid
 from softfinger.kinematics.sensing.solid_pressure import Weights
@@ -176,20 +177,14 @@ class Cells(NamedTuple):
     errors: FloatArray  # patterns of the common errors [SOURCES, ·]
 
 
-# Row indices.
-REACH, X, Y, HEIGHT, PATTERN, MODEL, RESIDUAL, FACTOR, JACOBIAN = range(PARAMETERS, PARAMETERS + 9)
-ERRORS = JACOBIAN + PARAMETERS
-ROWS = ERRORS + SOURCES
-
-
-@inner_kernel
-def cells_in(rows: FloatArray, grid: Grid) -> Cells:
-    """Return the cell arrays stored in ``rows`` [ROWS, cells]."""
-    planes = rows[:SHEAR_X].reshape((SHEAR_X, grid.rows, grid.cols))
-    return Cells(
-        rows[:PARAMETERS], planes, rows[REACH], rows[X], rows[Y], rows[HEIGHT], rows[PATTERN],
-        rows[MODEL], rows[RESIDUAL], rows[FACTOR], rows[JACOBIAN:ERRORS], rows[ERRORS:],
-    )  # fmt: skip
+def new_cells(rows: int, cols: int) -> Cells:
+    """Create the arrays of a grid with rows × cols cells, filled with zeros."""
+    count = rows * cols
+    sensitivity = np.zeros((PARAMETERS, count))
+    planes = sensitivity[:SHEAR_X].reshape(SHEAR_X, rows, cols)
+    vectors = (np.zeros(count) for _ in range(8))
+    jacobian, errors = np.zeros((PARAMETERS, count)), np.zeros((SOURCES, count))
+    return Cells._make([sensitivity, planes, *vectors, jacobian, errors])
 
 
 class Model(NamedTuple):

@@ -144,27 +144,33 @@ def set_weights(weights: Weights, d: float, n_x: float, n_y: float) -> None:
     values[0, 0] = normal * cosine * held
     values[1, 0] = (normal_d * held + normal * held_t * t_d) * cosine
     values[2, 0], values[3, 0] = n_x * both, n_y * both
-    # (n_x + i n_y)^m, and its derivative divided by m. The modes are sorted by m.
+    # Real and imaginary parts of (n_x + i n_y)^m, and of its derivative divided by m. The modes are
+    # sorted by m. Complex numbers would take longer to compile.
     m = 0
-    power = 1.0 + 0.0j
-    below = 0.0j
+    power_x, power_y = 1.0, 0.0
+    below_x, below_y = 0.0, 0.0
     at = 1
     for k in range(1, weights.modes):
         q = weights.q[k]
         q_t = weights.q_x[k] * table.by_root
         q_s = weights.q_y[k] * table.by_square
         while m < weights.harmonics[k]:
-            below = power
-            power *= complex(n_x, n_y)
+            below_x, below_y = power_x, power_y
+            power_x, power_y = below_x * n_x - below_y * n_y, below_x * n_y + below_y * n_x
             m += 1
-        turned = normal * q * m * below
-        along = 2.0 * (normal_s * q + normal * q_s) * power
-        partials = along * n_x + turned, along * n_y + turned * 1.0j
-        each = (normal * q * power, (normal_d * q + normal * q_t * t_d) * power, *partials)
-        for i in range(4):
-            values[i, at] = each[i].real
-            if m > 0:
-                values[i, at + 1] = each[i].imag
+        size = normal * q
+        by_d = normal_d * q + normal * q_t * t_d
+        by_square = 2.0 * (normal_s * q + normal * q_s)
+        turned_x, turned_y = size * m * below_x, size * m * below_y
+        values[0, at] = size * power_x
+        values[1, at] = by_d * power_x
+        values[2, at] = by_square * power_x * n_x + turned_x
+        values[3, at] = by_square * power_x * n_y - turned_y
+        if m > 0:
+            values[0, at + 1] = size * power_y
+            values[1, at + 1] = by_d * power_y
+            values[2, at + 1] = by_square * power_y * n_x + turned_y
+            values[3, at + 1] = by_square * power_y * n_y + turned_x
         at += 2 if m > 0 else 1
 
 

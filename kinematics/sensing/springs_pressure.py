@@ -262,12 +262,9 @@ def press_springs(
 
 @kernel
 def render(
-    faces: Records[Face], grids: Records[Grid], planes: FloatArray, line: FloatArray,
-    inverse: FloatArray, y: FloatArray, across: FloatArray, along: FloatArray, law: FloatArray,
-    sums: FloatArray,
-) -> Cells:  # fmt: skip
+    faces: Records[Face], grids: Records[Grid], planes: FloatArray, points: SpringPoints
+) -> Cells:
     """Run :func:`press_springs` with the first of ``faces``; the second is scratch memory."""
-    points = SpringPoints(line, inverse, y, across, along, law, sums)
     return press_springs(points, grids[0], faces[0], faces[1], planes)
 
 
@@ -304,5 +301,5 @@ class SpringsPressure:
             return
         n_z = math.sqrt(n_z)
         self._faces[0] = (self._radius - min(d, self._radius)) / n_z, n_x / n_z, n_y / n_z
-        first, last = render(self._faces, self._grid, self._planes, *self._points)
+        first, last = render(self._faces, self._grid, self._planes, self._points)
         np.multiply(gain, self._planes[STRESS, first:last], out=out[first:last])

@@ -11,13 +11,7 @@ from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.estimation import detection, gauss_newton
 from softfinger.kinematics.estimation.estimator import ContactEstimator, Readings, cell_centres
 from softfinger.kinematics.estimation.gauss_newton import CLIP_BELOW, free_noise
-from softfinger.kinematics.estimation.state import (
-    FACTOR,
-    GAIN,
-    ROWS,
-    EstimatorState,
-    cells_in,
-)
+from softfinger.kinematics.estimation.state import GAIN, Cells, EstimatorState, new_cells
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from tests.harness.paper_tip import LINEAR, PITCH, TIP, E
 
@@ -31,9 +25,8 @@ def activity(states: Records[EstimatorState], frame: FloatArray, height: FloatAr
 
 
 @kernel
-def compare(states: Records[EstimatorState], frame: FloatArray, rows: FloatArray) -> None:
+def compare(states: Records[EstimatorState], frame: FloatArray, cells: Cells) -> None:
     """Apply :func:`gauss_newton.compare` to all cells."""
-    cells = cells_in(rows, states[0].grid)
     gauss_newton.compare(states[0], frame, cells, index(0), index(frame.shape[0]))
 
 
@@ -93,23 +86,22 @@ def mean_of(model, floor, noise):
 def test_cells_near_the_floor_are_compared_with_their_expected_reading(floor):
     noise = 1500.0
     state = EstimatorState()
-    state.grid.rows = state.grid.cols = 1
     state.signal.scale, state.signal.saturation, state.signal.floor = 1.0, math.inf, floor
     state.fit.clip_noise, state.fit.contact[GAIN] = noise, 1.0
-    rows = np.zeros((ROWS, 1))
+    cells = new_cells(1, 1)
     for model in np.linspace(max(floor - 1.9 * noise, 20.0), floor + 6.0 * noise, 9):
-        rows[GAIN] = model
-        compare(state.array, np.array([3300.0]), rows)
+        cells.sensitivity[GAIN] = model
+        compare(state.array, np.array([3300.0]), cells)
         mean, response = mean_of(np.array(model), floor, noise)
         residual = 3300.0 - mean
         misfit = pytest.approx(residual**2, abs=2 * abs(residual) * 1e-3 * noise)
         assert state.fit.misfit == misfit
-        assert rows[FACTOR, 0] == pytest.approx(float(response), abs=5e-3)
+        assert cells.factor[0] == pytest.approx(float(response), abs=5e-3)
         assert state.fit.counted_cells == 1.0
     below = floor - (CLIP_BELOW + 0.1) * noise
     if below > 0.0:
-        rows[GAIN] = below
-        compare(state.array, np.array([3300.0]), rows)
+        cells.sensitivity[GAIN] = below
+        compare(state.array, np.array([3300.0]), cells)
         assert state.fit.counted_cells == 0.0
 
 
