@@ -51,12 +51,10 @@ from numba.core.typed_passes import (
     PreLowerStripPhis,
 )
 from numba.core.untyped_passes import (
-    DeadBranchPrune,
     FixupArgs,
     GenericRewrites,
     IRProcessing,
     ReconstructSSA,
-    RewriteSemanticConstants,
     TranslateByteCode,
 )
 
@@ -89,15 +87,11 @@ class KernelCompiler(CompilerBase):
 
     def define_pipelines(self) -> list[Any]:
         """Return the compiler passes in the order of execution."""
-        # For some arguments, Numba cannot type branches such as `if blur is None`, so prune these
-        # branches.
-        nones = types.none in self.state.args
-        passes: list[Any] = [TranslateByteCode, FixupArgs, IRProcessing]
-        passes += [RewriteSemanticConstants, DeadBranchPrune] if nones else []
-        passes += [GenericRewrites, ReconstructSSA]
-        passes += [DeadBranchPrune] if nones else []
-        passes += [NopythonTypeInference, PreLowerStripPhis, NopythonRewrites]
-        passes += [IRLegalization, self.lowering, NoPythonBackend]
+        passes = (
+            TranslateByteCode, FixupArgs, IRProcessing, GenericRewrites, ReconstructSSA,
+            NopythonTypeInference, PreLowerStripPhis, NopythonRewrites, IRLegalization,
+            self.lowering, NoPythonBackend,
+        )  # fmt: skip
         pipeline = PassManager("kernel")
         for each in passes:
             pipeline.add_pass(each, each.__name__)
