@@ -1,4 +1,4 @@
-"""Lookup kernels for contact tables, and the table format of spring tips.
+"""Lookup kernels for contact tables, and the table formats.
 
 The table of a spring tip stores ratios. Each quantity is divided by its closed form for the modulus
 at zero strain. The ratios are smooth, close to 1 and finite as d → 0. For a constant modulus, the
@@ -11,7 +11,10 @@ The peak strain is 1 − u. The domain has 16 slabs per octave of h. Each slab i
 pieces of y as the tolerance requires. The domain ends at h = 1/8, because the ratios diverge as log
 h for h → 0.
 
-The kernels accept the record of any tip. Solid and measured tips are evaluated by `solid_lookup`.
+For solid and measured tips, all six outputs are derived from the energy U = E a³ t⁵ g (see
+`solid_data`). The function g(t, sin² θ) is a polynomial in t = √(d/a) and sin² θ. All outputs are
+therefore consistent to within rounding. For a sticking face, a second polynomial q_0 describes the
+reduction of the base force.
 """
 
 from __future__ import annotations
@@ -24,10 +27,6 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.kernel import inlined_kernel, inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import FloatArray, Records
 from softfinger.kinematics.contact.closed_form import HALF_PI
-from softfinger.kinematics.contact.solid_lookup import (
-    solid_lookup,
-    solid_normal,
-)
 from softfinger.kinematics.contact.table_record import (
     OCTAVES,
     SLAB_BITS,
@@ -41,6 +40,8 @@ from softfinger.kinematics.contact.table_record import (
 H_END = 0.5**OCTAVES  # h at the end of the domain
 _H_MIN = H_END * (1.0 + 2.0**-52)  # smallest number above H_END
 _END = H_END * (1.0 - 1e-12)  # h at which the domain ends, with a margin for rounding
+
+ENERGY, STICK = range(2)  # pieces of a solid tip's table: g and its partials, q_0 and its partials
 
 _MANTISSA = 52
 _FRACTION = (1 << _MANTISSA) - 1
@@ -113,6 +114,75 @@ def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
     )
 
 
+@inlined_kernel
+def normal_force(table: Table, t: float, square: float) -> Lanes:
+    """Return the normal force N, the energy U and their partials.
+
+    The values are N/a² [Pa] with its ∂/∂d and ∂/∂sin² θ, and U/a³ [Pa] with its ∂/∂sin² θ.
+    """
+    place = t * table.by_root - 1.0, square * table.by_square - 1.0
+    g, g_t, g_tt, g_s, g_ts = lanes(table, ENERGY, *place)
+    size = table.modulus * t * t * t
+    by_d = 0.25 * table.modulus * table.inverse_radius * t * (15.0 * g + t * (9.0 * g_t + t * g_tt))
+    by_square = size * (2.5 * g_s + 0.5 * t * g_ts)
+    return size * (2.5 * g + 0.5 * t * g_t), by_d, by_square, size * t * t * g, size * t * t * g_s
+
+
+@inlined_kernel
+def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
+    """Return F/(N cos θ) = 1 − sin² θ q_0 and its partials with respect to t and sin² θ."""
+    if not table.sticks:
+        return 1.0, 0.0, 0.0
+    x = t * table.by_root - 1.0
+    y = square * table.by_square - 1.0
+    q, q_t, q_s, _, _ = lanes(table, STICK, x, y)
+    return 1.0 - square * q, -square * q_t, -q - square * q_s
+
+
+@inner_kernel
+def _solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
+    """Evaluate :func:`lookup` for a solid or measured tip.
+
+    If |θ| is beyond the range of the data, the energy is assumed to be independent of θ. The
+    partials are consistent with this assumption. The force still varies with cos θ.
+    """
+    within = abs(theta) <= table.tilt
+    inside = within and d <= table.deepest
+    angle = min(max(theta, -HALF_PI), HALF_PI)
+    s = math.sin(angle)
+    c = math.cos(angle)
+    t = math.sqrt(min(d, table.deepest) * table.inverse_radius)
+    square = s * s if within else 2.0 / table.by_square
+    # The chain rule gives d(sin² θ)/dθ = 2 sin θ cos θ.
+    chain = 2.0 * s * c if within else 0.0
+    a = table.radius
+    area = a * a
+    normal, stiffness, normal_s, energy, energy_s = normal_force(table, t, square)
+    held, held_t, held_s = _clamped(table, t, square)
+    return (
+        c * area * normal * held,
+        a * area * energy,
+        c * area * (stiffness * held + normal * held_t * 0.5 / (a * t)),
+        area * ((c * chain * normal_s - s * normal) * held + c * normal * chain * held_s),
+        area * normal,
+        chain * a * area * energy_s,
+        inside,
+    )
+
+
+@inner_kernel
+def _solid_normal(table: Table, d: float, theta: float) -> ThreeFloats:
+    """Evaluate :func:`normal_at` for a sticking face."""
+    within = abs(theta) <= table.tilt
+    s = math.sin(theta)
+    t = math.sqrt(d * table.inverse_radius)
+    square = s * s if within else 2.0 / table.by_square
+    normal, stiffness, normal_s, _, _ = normal_force(table, t, square)
+    chain = 2.0 * s * math.cos(theta) if within else 0.0
+    area = table.radius * table.radius
+    return area * normal, area * stiffness, area * chain * normal_s
+
+
 @inner_kernel
 def lookup_at(table: Table, d: float, theta: float) -> SixFloats:
     """Evaluate :func:`lookup` for a single table record."""
@@ -122,7 +192,7 @@ def lookup_at(table: Table, d: float, theta: float) -> SixFloats:
     if d <= 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
     if table.is_solid:
-        return solid_lookup(table, d, theta)
+        return _solid_lookup(table, d, theta)
     return _springs_lookup(table, d, theta)
 
 
@@ -135,7 +205,7 @@ def normal_at(
     ``forces`` contains F, ∂F/∂d and ∂F/∂θ at the same d and θ.
     """
     if table.sticks:
-        return solid_normal(table, d, theta)
+        return _solid_normal(table, d, theta)
     force, force_d, force_theta = forces
     more = force_theta + force * tangent
     return force * inverse_cosine, force_d * inverse_cosine, more * inverse_cosine

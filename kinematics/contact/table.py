@@ -17,8 +17,7 @@ from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
 from softfinger.kinematics.contact.lookup import lookup, lookups
 from softfinger.kinematics.contact.material import Material
-from softfinger.kinematics.contact.solid_lookup import solid_table
-from softfinger.kinematics.contact.table_build import build
+from softfinger.kinematics.contact.table_build import build, solid_table
 from softfinger.kinematics.contact.table_record import Table
 
 __all__ = ["Certificate", "ContactForces", "ContactTable"]

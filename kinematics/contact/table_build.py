@@ -1,4 +1,7 @@
-"""Fit contact tables to the reference integrals, with a certified error bound.
+"""Build contact tables for all tip models.
+
+The tables of solid and measured tips reproduce their data. The tables of spring tips are fitted to
+the reference integrals, with a certified error bound.
 
 The error is bounded for each piece of the table, over the whole domain including its edges. The
 bound is the sum of three terms: the Chebyshev coefficients that the piece omits, an estimate of the
@@ -21,10 +24,11 @@ from numpy.polynomial import chebyshev
 
 from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip
-from softfinger.kinematics.contact.lookup import H_END
+from softfinger.kinematics.contact.lookup import ENERGY, H_END, STICK
 from softfinger.kinematics.contact.material import Material
+from softfinger.kinematics.contact.material_fit import MaterialError
 from softfinger.kinematics.contact.quadrature import ratios
-from softfinger.kinematics.contact.solid_data import to_powers
+from softfinger.kinematics.contact.solid_data import solid_data, to_powers, with_partials
 from softfinger.kinematics.contact.table_record import (
     LANES,
     OCTAVES,
@@ -184,3 +188,34 @@ def _ratios_at(material: Material, h: FloatArray, y: FloatArray) -> FloatArray:
     s = h * np.sqrt((1.0 - y) * (1.0 + y) / complement)
     found = ratios(material, delta.ravel(), h.ravel(), s.ravel(), c.ravel())
     return found.reshape(LANES, *h.shape)
+
+
+def solid_table(tip: Fingertip, material: Material) -> Table:
+    """Return the table of a solid or measured ``tip``; the material is ignored for a measured tip.
+
+    Raises MaterialError if the tip is solid and the material is not linear.
+    """
+    table = Table()
+    table.is_solid = True
+    law = tip.law
+    if law is not None:
+        root, square = law.root, law.square
+        energy = with_partials(law.energy(), root, square)
+        table.radius, table.max_error = law.radius, law.force_error
+        table.modulus = 1.0  # The coefficients of the measured energy are in Pa.
+    elif material.is_linear:
+        data = solid_data(tip)
+        root, square, energy = data.root, data.square, data.energy
+        table.radius, table.max_error = tip.radius, data.error
+        table.modulus = material.reference_modulus
+        table.at_first = 8.0 / (15.0 * (1.0 - tip.poisson**2))
+        table.sticks = tip.face == "sticking"
+        set_piece(table, STICK, data.stick)
+    else:
+        raise MaterialError("a solid tip's material must have a constant modulus")
+    table.inverse_radius = 1.0 / table.radius
+    table.deepest = root**2 * table.radius
+    table.tilt = math.asin(math.sqrt(square))
+    table.by_root, table.by_square = 2.0 / root, 2.0 / square
+    set_piece(table, ENERGY, energy)
+    return table

@@ -2,7 +2,7 @@
 
 A table consists of pieces. Each piece has five polynomials (lanes) in two variables. The lanes are
 evaluated together. The meaning of the polynomials and of their variables depends on the tip model;
-see `lookup` and `solid_lookup`.
+see `lookup`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class TableError(SoftfingerError):
 class Table(Record):
     """Contact table of one tip and material."""
 
-    is_solid: bool  # True for a solid or measured tip, which `solid_lookup` evaluates
+    is_solid: bool  # True for a solid or measured tip
     is_closed: bool  # True for springs with a constant modulus, whose table has no pieces
     sticks: bool
     splits: int  # pieces per slab

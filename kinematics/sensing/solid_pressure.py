@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from softfinger.kinematics.compiled.kernel import fast_inner_kernel, index, inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import FloatArray, IntArray, Record, Records
 from softfinger.kinematics.contact.closed_form import Fingertip
+from softfinger.kinematics.contact.lookup import normal_force
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.solid_data import solid_data
-from softfinger.kinematics.contact.solid_lookup import normal_force, solid_table
+from softfinger.kinematics.contact.table_build import solid_table
 from softfinger.kinematics.contact.table_record import Table
 from softfinger.kinematics.sensing.blur import axis_points, cell_means
 from softfinger.kinematics.sensing.footprint import Grid, axes
