@@ -24,11 +24,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from softfinger.kinematics.compiled.layout import FloatArray
 
 __all__ = ["HandGeometry"]
-
-FloatArray = NDArray[np.float64]
 
 
 def tip_position(

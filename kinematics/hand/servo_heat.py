@@ -17,13 +17,8 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
-
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
-from softfinger.kinematics.compiled.layout import Record, Records
-
-FloatArray = NDArray[np.float64]
+from softfinger.kinematics.compiled.layout import FloatArray, Record, Records
 
 WINDING, CASE, AMBIENT, HEATING = range(4)
 COPPER = 0.0039  # temperature coefficient of the winding's resistance [1/K]
