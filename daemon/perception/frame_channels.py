@@ -268,7 +268,9 @@ def update(
         _set_d_slopes(h, finger, 1.0, 1.0, scan.d_rate)
         _update_footprint(h, finger, d_innovation, d_noise)
     if is_fitted and not h.gain_is_known and gain > 0.0:
-        noise = covariance - systematic
+        both_noise = covariance[0, 3] - systematic[0, 3]
+        gain_noise = covariance[3, 3] - systematic[3, 3]
+        noise = d_noise, both_noise, gain_noise
         _update_amplitude(h, finger, scan, (d, gain), noise, pending_variance)
     h.mean[D + finger] = max(h.mean[D + finger], D_MIN)
     return True
@@ -280,20 +282,21 @@ def _update_amplitude(
     finger: int,
     scan: Scan,
     found: FloatPair,
-    noise: FloatArray,
+    noise: tuple[float, float, float],
     pending_variance: float,
 ) -> None:
     """Update the state with the amplitude of a frame.
 
-    ``found`` is (d, gain), and ``noise`` is the frame covariance without its systematic part. The
-    errors of d and gain are correlated. The footprint update has already used the correlated part
-    of the errors. The amplitude update therefore uses only the uncorrelated part. The relative
-    amplitude error due to pending motion is as large as the relative error of d.
+    ``found`` is (d, gain). ``noise`` contains the variance of d including the pending motion, the
+    covariance of d and gain, and the variance of gain. The noise excludes errors that all frames
+    share. The errors of d and gain are correlated. The footprint update has already used the
+    correlated part of the errors. The amplitude update therefore uses only the uncorrelated part.
+    The relative amplitude error due to pending motion is as large as the relative error of d.
     """
     d, gain = found
-    d_noise = noise[0, 0] + pending_variance
-    ratio = noise[0, 3] / (d_noise * gain)
-    own_noise = max(noise[3, 3] / (gain * gain) - ratio * ratio * d_noise, 0.0)
+    d_noise, both_noise, gain_noise = noise
+    ratio = both_noise / (d_noise * gain)
+    own_noise = max(gain_noise / (gain * gain) - ratio * ratio * d_noise, 0.0)
     own_noise += pending_variance / (d * d)
     d_residual = d - (h.mean[D + finger] - scan.d + h.mean[D_BIAS + finger])
     innovation = math.log(gain) - ratio * d_residual
