@@ -18,6 +18,7 @@ from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.hand_state import GATE
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
+from softfinger.kinematics.hand.grasp_state import Lengths
 from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
@@ -347,7 +348,7 @@ def _dither(g: GripState, grasp: GraspState, target: float) -> float:
     """
     law, q = g.law, grasp.q
     antisymmetric = 0.5 * (q[0] - q[1])
-    lengths = (law.half_separation, law.length, law.offset, law.radius)
+    lengths = Lengths(law.half_separation, law.length, law.offset, law.radius)
     spring = upright_spring(mean(q), mean(grasp.d), target, grasp.tilt_moment_ratio, lengths)
     spring = min(spring, g.joint_stiffness)
     # Set `offset` so that the torque does not jump when the dither ends and the hold begins.

@@ -220,8 +220,8 @@ def update(
     is_fitted = covariance[3, 3] > 0.0
     shows_d = is_fitted or h.gain_is_known
     tilt = total_tilt(found.theta, found.tilt_y)
-    frame_force, _, stiffness, _, _, _, _ = lookup(table, found.d, tilt)
-    log_slope = stiffness / frame_force
+    shown = lookup(table, found.d, tilt)
+    log_slope = shown.force_d / shown.force
     d, gain = found.d, found.gain / scan.relaxation
     if h.gain_is_known and not is_fitted:  # The amplitude determines d.
         d -= math.log(scan.relaxation) / log_slope
@@ -256,10 +256,10 @@ def update(
     _update_angle(h, finger, sense, angle_innovation, theta_noise, scan.theta_rate, is_new_contact)
     tip.in_contact = True
     if tip.gain_is_unknown:
-        expected, _, stiffness, _, _, _, _ = lookup(table, max(d_at_scan, D_MIN), tilt)
+        expected = lookup(table, max(d_at_scan, D_MIN), tilt)
         smoothing = 0.0 if is_new_contact else _SLOPE_SMOOTHING
-        tip.log_slope = interpolate(stiffness / expected, tip.log_slope, smoothing)
-        innovation = math.log(frame_force / (scan.relaxation * expected))
+        tip.log_slope = interpolate(expected.force_d / expected.force, tip.log_slope, smoothing)
+        innovation = math.log(shown.force / (scan.relaxation * expected.force))
         innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]
         _set_d_slopes(h, finger, tip.log_slope, 0.0, scan.d_rate)
         h.slopes[MODULUS + finger] = h.slopes[GAIN + finger] = 1.0

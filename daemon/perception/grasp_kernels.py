@@ -51,8 +51,8 @@ from softfinger.kinematics.compiled.layout import Records
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import (
     FloatPair,
-    Motion,
-    holding_moment_arms,
+    HeldMotion,
+    holding_forces,
     load_torques,
     total_tilt,
 )
@@ -169,10 +169,10 @@ def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> T
     grasp = h.grasp
     tilt = total_tilt(theta, tip.tilt_y)
     d = h.mean[D + finger]
-    force, energy, stiffness, by_tilt, _, _, inside = lookup(table, d, tilt)
+    found = lookup(table, d, tilt)
     modulus = _modulus(h, finger)
-    force *= modulus
-    stiffness *= modulus
+    force = modulus * found.force
+    stiffness = modulus * found.force_d
     grasp.q[finger] = tip.q
     grasp.d[finger] = max(d, 0.0)
     grasp.force[finger] = force
@@ -188,18 +188,18 @@ def _write_tip(h: HandFilter, finger: int, theta: float, table: FloatArray) -> T
     h.slopes[:] = 0.0
     d_shared = tip.shared_variance[0]
     law = _relative_law_error(tip, d / h.radius) * force
-    by_angle = modulus * by_tilt * (theta / tilt if tilt > 0.0 else 0.0)
+    by_angle = modulus * found.force_theta * (theta / tilt if tilt > 0.0 else 0.0)
     force_variance = by_state + stiffness * stiffness * d_shared
     force_variance += by_angle * by_angle * theta_variance + law * law
     return TipResult(
         grasp.d[finger],
         theta,
         force,
-        modulus * energy,
+        modulus * found.energy,
         math.sqrt(max(h.covariance[D + finger, D + finger], 0.0) + d_shared),
         math.sqrt(theta_variance),
         math.sqrt(force_variance),
-        inside,
+        found.inside,
     )
 
 
@@ -220,11 +220,10 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     grasp.t = h.t
     grasp.angle_std = math.sqrt(max(h.covariance[ANGLE, ANGLE], 0.0))
     grasp.taper = taper
-    arm1, arm2, turn1, turn2, grasp.jacobian_slide, width, _ = motion
-    grasp.moment_arm[0] = arm1
-    grasp.moment_arm[1] = arm2
-    grasp.jacobian_rotation[0] = turn1
-    grasp.jacobian_rotation[1] = turn2
+    grasp.jacobian_slide = motion.slide
+    for k in range(2):
+        grasp.moment_arm[k] = motion.arm[k]
+        grasp.jacobian_rotation[k] = motion.turn[k]
     _write_load(h, table1, table2, theta, motion)
     _write_shear(h)
     if (left.has_new_frame or right.has_new_frame) and is_held(h) and not h.is_single:
@@ -232,33 +231,29 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
         if grasp.load_arm > 0.0 and dt > 0.0:
             _update_by_torques(h, dt)
     _write_consistency(h)
-    return GraspResult(result1, result2, angle, width)
+    return GraspResult(result1, result2, angle, motion.width)
 
 
 @inner_kernel
 def _write_load(
-    h: HandFilter, table1: FloatArray, table2: FloatArray, theta: FloatPair, motion: Motion
+    h: HandFilter, table1: FloatArray, table2: FloatArray, theta: FloatPair, motion: HeldMotion
 ) -> None:
     """Write the normal forces, the shear at equilibrium, and the torques attributed to a load."""
     grasp = h.grasp
     taper = h.mean[TAPER]
     d = h.mean[D], h.mean[D + 1]
-    energy_arm1, energy_arm2, shear, normal1, normal2 = holding_moment_arms(
-        table1, table2, d, theta, taper, motion
-    )
-    grasp.energy_arm[0] = energy_arm1
-    grasp.energy_arm[1] = energy_arm2
-    by_taper = 0.5 * math.tan(0.5 * taper) * (normal1 + normal2)
+    held = holding_forces(table1, table2, d, theta, taper, motion)
+    shear = held.shear
+    normal = held.normal[0] + held.normal[1]
+    by_taper = 0.5 * math.tan(0.5 * taper) * normal
     grasp.shear = 0.0
-    if normal1 + normal2 > 0.0:
-        grasp.shear = 2.0 * (abs(shear) + abs(by_taper)) / (normal1 + normal2)
+    if normal > 0.0:
+        grasp.shear = 2.0 * (abs(shear) + abs(by_taper)) / normal
     modulus1 = _modulus(h, 0)
     modulus2 = _modulus(h, 1)
-    grasp.normal[0] = modulus1 * normal1
-    grasp.normal[1] = modulus2 * normal2
     torque1 = h.tip[0].torque / (1.0 + h.mean[TORQUE])
     torque2 = h.tip[1].torque / (1.0 + h.mean[TORQUE + 1])
-    residual1, residual2, grasp.load_arm, curvature = load_torques(
+    load = load_torques(
         table1,
         table2,
         d,
@@ -268,9 +263,13 @@ def _write_load(
         (shear - by_taper, shear + by_taper),
         (torque1 / modulus1, torque2 / modulus2),
     )
-    grasp.torque_residual[0] = modulus1 * residual1
-    grasp.torque_residual[1] = modulus2 * residual2
-    grasp.load_curvature = 2.0 * curvature / (modulus1 + modulus2)
+    grasp.load_arm = load.arm
+    grasp.load_curvature = 2.0 * load.curvature / (modulus1 + modulus2)
+    for k in range(2):
+        modulus = modulus1 if k == 0 else modulus2
+        grasp.energy_arm[k] = held.energy_arm[k]
+        grasp.normal[k] = modulus * held.normal[k]
+        grasp.torque_residual[k] = modulus * load.residual[k]
 
 
 @inner_kernel

@@ -303,10 +303,11 @@ class HandEstimator:
         contact.inside = True
         if not estimate.contact:
             # Noise may hide a light contact.
-            contact.force_std = lookup(table, contact.d_std, 0.0)[0]
+            contact.force_std = lookup(table, contact.d_std, 0.0).force
             return
         tilt = total_tilt(contact.theta, contact.tilt_y)
-        force, energy, by_d, by_tilt, _, _, contact.inside = lookup(table, contact.d, tilt)
+        found = lookup(table, contact.d, tilt)
+        contact.inside = found.inside
         stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
         if estimate.covariance[3, 3] > 0.0:
             expected = prior.modulus[0] * prior.gain[0]
@@ -314,10 +315,11 @@ class HandEstimator:
             factor_variance = stiff * gain / (stiff + gain)
         else:
             modulus, factor_variance = contact.gain / prior.gain[0], gain
-        contact.force, contact.energy = modulus * force, modulus * energy
+        contact.force, contact.energy = modulus * found.force, modulus * found.energy
         along = contact.theta / tilt if tilt > 0.0 else 0.0
         across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
-        slopes = modulus * np.array([by_d, by_tilt * along, by_tilt * across])
+        by_tilt = found.force_theta
+        slopes = modulus * np.array([found.force_d, by_tilt * along, by_tilt * across])
         fraction = contact.d / self._state.radius
         law_error = np.interp(
             fraction, np.linspace(0.0, 1.0, LAW_POINTS), self._state.tip[finger].law_error

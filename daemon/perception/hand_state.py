@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.perception.grasp import ENCODER_CHANNEL, GraspState
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.compiled.layout import Pair, Record, Records
-from softfinger.kinematics.hand.grasp_state import FloatPair, Motion, held_motion
+from softfinger.kinematics.hand.grasp_state import FloatPair, HeldMotion, Lengths, held_motion
 
 FloatArray = NDArray[np.float64]
 
@@ -221,11 +221,11 @@ def joint_angle(h: HandFilter, finger: int) -> float:
 
 
 @inner_kernel
-def motion_of(h: HandFilter) -> Motion:
+def motion_of(h: HandFilter) -> HeldMotion:
     """Return the Jacobian of the held object; see `hand.grasp_state.held_motion`."""
     q = joint_angle(h, 0), joint_angle(h, 1)
     d = h.mean[D], h.mean[D + 1]
-    lengths = h.half_separation, h.length, h.offset, h.radius
+    lengths = Lengths(h.half_separation, h.length, h.offset, h.radius)
     return held_motion(q, d, h.mean[ANGLE], h.mean[TAPER], lengths)
 
 
@@ -379,13 +379,15 @@ def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
     """
     left = h.tip[0]
     right = h.tip[1]
-    arm1, arm2, turn1, turn2, slide, _, across = motion_of(h)
+    motion = motion_of(h)
+    arm1, arm2 = motion.arm
+    turn1, turn2 = motion.turn
     # Before contact, the gap shrinks at the rate at which d grows during contact.
     if h.is_single:
         by1, by2 = arm1, arm2
     else:
-        by1 = 0.5 * (arm1 + slide * turn1)
-        by2 = 0.5 * (arm2 - slide * turn2)
+        by1 = 0.5 * (arm1 + motion.slide * turn1)
+        by2 = 0.5 * (arm2 - motion.slide * turn2)
     if not (left.in_contact and right.in_contact):
         turn1 = turn2 = 0.0
     step1, step2 = step
@@ -412,7 +414,7 @@ def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
     if dt > 0.0:
         rotation_error = MODEL_ERROR * rotation
         # In a rotation, the fingers move in opposite directions, so their errors do not cancel.
-        apart = across + 2.0 * h.radius - h.mean[D] - h.mean[D + 1]
+        apart = motion.across + 2.0 * h.radius - h.mean[D] - h.mean[D + 1]
         closing_error = MODEL_ERROR * math.hypot(d_step1, 0.5 * apart * rotation)
         sideways_error = MODEL_ERROR * (arm1 * step1 - arm2 * step2)
         if h.is_single:  # The missing finger does not move.

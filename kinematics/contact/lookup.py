@@ -31,7 +31,7 @@ from softfinger.kinematics.contact.table_record import (
     OCTAVES,
     SLAB_BITS,
     Lanes,
-    SixFloats,
+    LookupResult,
     Table,
     ThreeFloats,
     lanes,
@@ -74,7 +74,7 @@ def _ratios(table: Table, h: float, y: float) -> Lanes:
 
 
 @inner_kernel
-def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
+def _springs_lookup(table: Table, d: float, theta: float) -> LookupResult:
     """Evaluate :func:`lookup` for a spring tip."""
     radius = table.radius
     h = (radius - d) * table.inverse_radius
@@ -103,7 +103,7 @@ def _springs_lookup(table: Table, d: float, theta: float) -> SixFloats:
     force_by_d = math.pi * table.modulus * d * inverse
     force = force_by_d * d
     energy = force * inverse * d * (1.0 / 3.0)
-    return (
+    return LookupResult(
         force * r_f,
         energy * r_u,
         2.0 * force_by_d * r_fd,
@@ -140,7 +140,7 @@ def _clamped(table: Table, t: float, square: float) -> ThreeFloats:
 
 
 @inner_kernel
-def _solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
+def _solid_lookup(table: Table, d: float, theta: float) -> LookupResult:
     """Evaluate :func:`lookup` for a solid or measured tip.
 
     If |θ| is beyond the range of the data, the energy is assumed to be independent of θ. The
@@ -159,7 +159,7 @@ def _solid_lookup(table: Table, d: float, theta: float) -> SixFloats:
     area = a * a
     normal, stiffness, normal_s, energy, energy_s = normal_force(table, t, square)
     held, held_t, held_s = _clamped(table, t, square)
-    return (
+    return LookupResult(
         c * area * normal * held,
         a * area * energy,
         c * area * (stiffness * held + normal * held_t * 0.5 / (a * t)),
@@ -184,13 +184,13 @@ def _solid_normal(table: Table, d: float, theta: float) -> ThreeFloats:
 
 
 @inner_kernel
-def lookup_at(table: Table, d: float, theta: float) -> SixFloats:
+def lookup_at(table: Table, d: float, theta: float) -> LookupResult:
     """Evaluate :func:`lookup` for a single table record."""
     if math.isnan(d) or math.isnan(theta):
         nan = math.nan
-        return nan, nan, nan, nan, nan, nan, False
+        return LookupResult(nan, nan, nan, nan, nan, nan, False)
     if d <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True
+        return LookupResult(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, True)
     if table.is_solid:
         return _solid_lookup(table, d, theta)
     return _springs_lookup(table, d, theta)
@@ -223,8 +223,8 @@ def stiffness_ahead(table: Table, scale: float, depth: float) -> float:
 
 
 @kernel
-def lookup(tables: Records[Table], d: float, theta: float) -> SixFloats:
-    """Return (F, U, ∂F/∂d, ∂F/∂θ, ∂U/∂d, ∂U/∂θ, inside) at displacement d [m] and tilt θ [rad].
+def lookup(tables: Records[Table], d: float, theta: float) -> LookupResult:
+    """Return force, energy and their partials at displacement d [m] and tilt θ [rad].
 
     The values are zero for d ≤ 0 and NaN for NaN input. If d or θ is outside the domain, it is
     clamped to the domain and ``inside`` is False.

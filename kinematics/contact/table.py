@@ -207,7 +207,7 @@ class ContactTable:
                 return ContactForces(f, u, f_d, f_theta, u_d, u_theta, inside, self.max_error)
             d, theta = depth.item(), tilt.item()
         found = lookup(self.data, d, theta)
-        if not (found[6] or edge):
+        if not (found.inside or edge):
             self._warn(np.array([d]), np.array([theta]))
         numbers: ContactForces = _numbers(ContactForces, (*found, self.max_error))
         return numbers

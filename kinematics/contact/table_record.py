@@ -7,7 +7,7 @@ see `lookup`.
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
 from softfinger import SoftfingerError
 from softfinger.kinematics.compiled.kernel import index, inlined_kernel
@@ -16,7 +16,6 @@ from softfinger.kinematics.compiled.layout import FloatArray, Record
 __all__ = ["TableError"]
 
 Lanes: TypeAlias = tuple[float, float, float, float, float]
-SixFloats: TypeAlias = tuple[float, float, float, float, float, float, bool]
 ThreeFloats: TypeAlias = tuple[float, float, float]
 
 LANES = 5
@@ -30,6 +29,18 @@ PIECES = OCTAVES * 2**SLAB_BITS * SPLITS_MAX
 
 class TableError(SoftfingerError):
     """Error raised if a table cannot be built within the tolerance."""
+
+
+class LookupResult(NamedTuple):
+    """Force F and energy U of a tip at one displacement d and tilt θ, with their partials."""
+
+    force: float  # F [N]
+    energy: float  # U [J]
+    force_d: float  # ∂F/∂d [N/m]
+    force_theta: float  # ∂F/∂θ [N/rad]
+    energy_d: float  # ∂U/∂d [N]
+    energy_theta: float  # ∂U/∂θ [N·m/rad]
+    inside: bool  # False if d or θ was clamped to the domain of the table
 
 
 class Table(Record):

@@ -14,19 +14,54 @@ The bisector of the faces has the angle φ.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from numpy import float64
 from numpy.typing import NDArray
 
 from softfinger.kinematics.compiled.kernel import inner_kernel, kernel
 from softfinger.kinematics.contact.lookup import lookup
+from softfinger.kinematics.contact.table_record import LookupResult
 from softfinger.kinematics.hand.geometry import tip_position, tip_velocity
 
 FloatPair = tuple[float, float]  # (left, right)
-Motion = tuple[float, float, float, float, float, float, float]  # result of `held_motion`
-
 _tip_position, _tip_velocity = inner_kernel(tip_position), inner_kernel(tip_velocity)
 _SHEAR_STEPS = 3  # number of iterations for the shear forces; each one gains two digits
+
+
+class Lengths(NamedTuple):
+    """Dimensions of a hand [m]."""
+
+    half_separation: float  # half the pivot separation
+    finger: float
+    offset: float  # fingertip offset
+    radius: float  # tip radius
+
+
+class HeldMotion(NamedTuple):
+    """Jacobian and width of a held object; see :func:`held_motion`."""
+
+    arm: FloatPair  # ∂(d1 + d2)/∂q [m]
+    turn: FloatPair  # rolling ratios in φ̇ = turn1 q̇1 − turn2 q̇2
+    slide: float  # ∂(d1 + d2)/∂φ [m/rad]
+    width: float  # distance between the contacts [m]
+    across: float  # the same along the bisector's normal, W [m]
+
+
+class HoldingForces(NamedTuple):
+    """Moment arms and forces of an object held in equilibrium without a load."""
+
+    energy_arm: FloatPair  # joint torque divided by the mean tip force [m]
+    shear: float  # mean shear force T [N]
+    normal: FloatPair  # N1, N2 [N]
+
+
+class LoadModel(NamedTuple):
+    """Residual joint torques, and the coefficients of the torque that a load L causes."""
+
+    residual: FloatPair  # [N·m]
+    arm: float  # [m]
+    curvature: float  # [m/N]
 
 
 @kernel
@@ -41,13 +76,12 @@ def held_motion(
     d: FloatPair,
     angle: float,
     taper: float,
-    lengths: tuple[float, float, float, float],
-) -> Motion:
-    """Return (arm1, arm2, turn1, turn2, slide, width, across) of a held object.
+    lengths: Lengths,
+) -> HeldMotion:
+    """Return the Jacobian and the width of a held object.
 
-    ``lengths`` [m] are half the pivot separation, the finger length, the finger offset and the tip
-    radius. The vector v_i is the derivative of tip position i with respect to q_i. If the tips roll
-    without slip and both displacements change by the same amount,
+    The vector v_i is the derivative of tip position i with respect to q_i. If the tips roll without
+    slip and both displacements change by the same amount,
 
         φ̇ = turn1 q̇1 − turn2 q̇2      turn_i W = a − d_i − v_i·t/cos(α/2)
         ḋ1 + ḋ2 = arm1 q̇1 + arm2 q̇2 + slide φ̇
@@ -77,11 +111,13 @@ def held_motion(
     vx2, vy2 = _tip_velocity(q2, -1.0, length, offset)
     across = d1 + d2 - 2.0 * radius + longer * ((x2 - x1) * nx + (y2 - y1) * ny)
     bounded = max(across, 0.5 * radius)
-    return (
-        longer * (vx1 * nx + vy1 * ny) - face_slope * (radius - d1),
-        -longer * (vx2 * nx + vy2 * ny) - face_slope * (radius - d2),
-        (radius - d1 - longer * (vy1 * nx - vx1 * ny)) / bounded,
-        (radius - d2 - longer * (vy2 * nx - vx2 * ny)) / bounded,
+    arm1 = longer * (vx1 * nx + vy1 * ny) - face_slope * (radius - d1)
+    arm2 = -longer * (vx2 * nx + vy2 * ny) - face_slope * (radius - d2)
+    turn1 = (radius - d1 - longer * (vy1 * nx - vx1 * ny)) / bounded
+    turn2 = (radius - d2 - longer * (vy2 * nx - vx2 * ny)) / bounded
+    return HeldMotion(
+        (arm1, arm2),
+        (turn1, turn2),
         longer * ((y1 - y2) * nx - (x1 - x2) * ny) + face_slope * (d1 - d2),
         across / longer,
         across,
@@ -90,7 +126,7 @@ def held_motion(
 
 @inner_kernel
 def sheared_gradient(
-    contact: tuple[float, float, float, float, float, float, bool],
+    contact: LookupResult,
     d: float,
     theta: float,
     tangential: float,
@@ -99,7 +135,7 @@ def sheared_gradient(
 
     ``contact`` is the result of a table lookup at ``d`` and ``theta``.
     """
-    force, _, force_d, force_theta, energy_d, energy_theta, _ = contact
+    force = contact.force
     sine = math.sin(theta)
     cosine = math.cos(theta)
     # Solve T = F (sin θ + 2 cos θ d_t/d) for the shear ratio d_t/d.
@@ -107,21 +143,25 @@ def sheared_gradient(
     shear = shear_ratio * d
     depth_change = shear * (sine + cosine * shear_ratio)
     return (
-        energy_d + force_d * depth_change - force * cosine * shear_ratio * shear_ratio,
-        energy_theta + force_theta * depth_change + force * shear * (cosine - sine * shear_ratio),
+        contact.energy_d
+        + contact.force_d * depth_change
+        - force * cosine * shear_ratio * shear_ratio,
+        contact.energy_theta
+        + contact.force_theta * depth_change
+        + force * shear * (cosine - sine * shear_ratio),
     )
 
 
 @inner_kernel
-def holding_moment_arms(
+def holding_forces(
     data1: NDArray[float64],
     data2: NDArray[float64],
     d: FloatPair,
     theta: FloatPair,
     taper: float,
-    motion: Motion,
-) -> tuple[float, float, float, float, float]:
-    """Return (τ1/F, τ2/F, T, N1, N2) of an object held in equilibrium.
+    motion: HeldMotion,
+) -> HoldingForces:
+    """Return the moment arms, the shear and the normal forces of an object held in equilibrium.
 
     The torques are the gradient of the energy along the rolling ``motion`` from
     :func:`held_motion`:
@@ -139,8 +179,9 @@ def holding_moment_arms(
     d1, d2 = d
     theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    arm1, arm2, turn1, turn2, slide, _, across = motion
+        return HoldingForces((0.0, 0.0), 0.0, (0.0, 0.0))
+    arm1, arm2 = motion.arm
+    turn1, turn2 = motion.turn
     contact1 = lookup(data1, d1, theta1)
     contact2 = lookup(data2, d2, theta2)
     tangential = normal = normal1 = normal2 = turning1 = turning2 = 0.0
@@ -154,16 +195,12 @@ def holding_moment_arms(
         normal1 = by_d1 - (tangential - out) * tangent1
         normal2 = by_d2 - (tangential + out) * tangent2
         normal = 0.5 * (normal1 + normal2)
-        tangential = (normal * slide + turning1 + turning2) / across
-    force = 0.5 * (contact1[0] + contact2[0])
-    moment = tangential * across
-    return (
-        (normal * arm1 + turning1 + moment * turn1) / force,
-        (normal * arm2 - turning2 - moment * turn2) / force,
-        tangential,
-        normal1,
-        normal2,
-    )
+        tangential = (normal * motion.slide + turning1 + turning2) / motion.across
+    force = 0.5 * (contact1.force + contact2.force)
+    moment = tangential * motion.across
+    torque1 = normal * arm1 + turning1 + moment * turn1
+    torque2 = normal * arm2 - turning2 - moment * turn2
+    return HoldingForces((torque1 / force, torque2 / force), tangential, (normal1, normal2))
 
 
 _SLOPE_MIN = 0.1  # minimum slope, relative to the slope without a load
@@ -185,7 +222,7 @@ def _unexplained(
     The residual is the joint torque, signed by ``side``, minus the contributions of N, ∂U/∂θ and T.
     """
     contact = lookup(data, d, theta)
-    force, _, force_d, force_theta, _, _, _ = contact
+    force = contact.force
     by_d, by_theta = sheared_gradient(contact, d, theta, shear)
     sine = math.sin(theta)
     cosine = math.cos(theta)
@@ -195,13 +232,17 @@ def _unexplained(
     depth_change_t = d * shear_ratio_t * (sine + 2.0 * cosine * shear_ratio)
     depth_change_tt = d * shear_ratio_t * cosine * shear_ratio_t
     normal_t = (
-        force_d * depth_change_t - 2.0 * force * cosine * shear_ratio * shear_ratio_t - tangent
+        contact.force_d * depth_change_t
+        - 2.0 * force * cosine * shear_ratio * shear_ratio_t
+        - tangent
     )
-    normal_tt = force_d * depth_change_tt - force * cosine * shear_ratio_t * shear_ratio_t
-    theta_t = force_theta * depth_change_t + force * d * shear_ratio_t * (
+    normal_tt = contact.force_d * depth_change_tt - force * cosine * shear_ratio_t * shear_ratio_t
+    theta_t = contact.force_theta * depth_change_t + force * d * shear_ratio_t * (
         cosine - 2.0 * sine * shear_ratio
     )
-    theta_tt = force_theta * depth_change_tt - force * d * shear_ratio_t * sine * shear_ratio_t
+    theta_tt = (
+        contact.force_theta * depth_change_tt - force * d * shear_ratio_t * sine * shear_ratio_t
+    )
     remaining = side * (torque - (by_d - shear * tangent) * arm) - by_theta - shear * moment_arm
     return (
         remaining,
@@ -217,10 +258,10 @@ def load_torques(
     d: FloatPair,
     theta: FloatPair,
     taper: float,
-    motion: Motion,
+    motion: HeldMotion,
     rolled: FloatPair,
     torques: FloatPair,
-) -> tuple[float, float, float, float]:
+) -> LoadModel:
     """Return the residual torques and the load model of a held object.
 
     δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t axis
@@ -230,20 +271,22 @@ def load_torques(
         τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
 
     where n_i and t_i belong to the face at each tip. ``rolled`` [N] are the shear forces without a
-    load, computed by :func:`holding_moment_arms`. Without a load, rolling, the turning moments and
+    load, computed by :func:`holding_forces`. Without a load, rolling, the turning moments and
     the ``taper`` [rad] cause the shear forces. N and ∂U/∂θ include the effect of the shear forces.
     ``motion`` is the result of :func:`held_motion`. For parallel faces, ±v_i·n equals arm_i and
     lever_i equals W turn_i.
 
-    δ_i is the residual of τ_i at L = 0. A load causes exactly (δ1 + δ2)/2 = moment_arm L +
-    curvature L². The function returns (δ1, δ2, moment_arm, curvature). All results are zero if a
-    tip is not in contact or if a load would not change the torques.
+    δ_i is the residual of τ_i at L = 0. A load causes exactly (δ1 + δ2)/2 = arm L + curvature L².
+    All results are zero if a tip is not in contact or if a load would not change the torques.
     """
     d1, d2 = d
     theta1, theta2 = theta
+    none = LoadModel((0.0, 0.0), 0.0, 0.0)
     if not (d1 > 0.0 and d2 > 0.0):
-        return 0.0, 0.0, 0.0, 0.0
-    arm1, arm2, turn1, turn2, _, _, across = motion
+        return none
+    arm1, arm2 = motion.arm
+    turn1, turn2 = motion.turn
+    across = motion.across
     # Remove the motion along the bisector, because it does not contribute to the moment arms.
     face_slope = math.tan(0.5 * taper)
     scale = 1.0 / (1.0 + face_slope * face_slope)
@@ -259,8 +302,8 @@ def load_torques(
     )
     moment_arm = 0.5 * (slope1 + slope2)
     if moment_arm <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0
-    return remaining1, -remaining2, moment_arm, 0.5 * (curvature1 - curvature2)
+        return none
+    return LoadModel((remaining1, -remaining2), moment_arm, 0.5 * (curvature1 - curvature2))
 
 
 @inner_kernel

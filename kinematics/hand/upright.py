@@ -28,22 +28,19 @@ from __future__ import annotations
 import math
 
 from softfinger.kinematics.compiled.kernel import inner_kernel
+from softfinger.kinematics.hand.grasp_state import Lengths
 
 _WIDTH_MIN = 0.1  # minimum of W − d, relative to the tip radius
 
 
 @inner_kernel
 def upright_spring(
-    q: float,
-    d: float,
-    force: float,
-    tilt_moment_ratio: float,
-    lengths: tuple[float, float, float, float],
+    q: float, d: float, force: float, tilt_moment_ratio: float, lengths: Lengths
 ) -> float:
     """Return the joint spring k [N·m/rad] that keeps the object upright at joint angle ``q`` [rad].
 
     ``d`` [m] and ``force`` [N] are averages over both tips. ``tilt_moment_ratio`` is the constant
-    c. ``lengths`` [m] are the same as in :func:`hand.grasp_state.held_motion`.
+    c.
     """
     half_separation, length, offset, radius = lengths
     inward = length * math.sin(q) + offset * math.cos(q)

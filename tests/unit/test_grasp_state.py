@@ -9,8 +9,10 @@ from softfinger import ContactTable, Fingertip, Material
 from softfinger.kinematics.compiled.kernel import kernel
 from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.hand.grasp_state import (
+    HeldMotion,
+    Lengths,
     held_motion,
-    holding_moment_arms,
+    holding_forces,
     load_of,
     load_torques,
     sheared_gradient,
@@ -21,14 +23,14 @@ from tests.harness.paper_tip import E
 from tests.harness.plant import PAPER
 from tests.harness.reference_hand import ReferenceHand
 
-holding_moment_arms = kernel(holding_moment_arms.py_func)
+holding_forces = kernel(holding_forces.py_func)
 sheared_gradient = kernel(sheared_gradient.py_func)
 held_motion = kernel(held_motion.py_func)
 load_of = kernel(load_of.py_func)
 load_torques = kernel(load_torques.py_func)
 
 HAND = ReferenceHand(finger_offset=0.003)
-LENGTHS = (HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)
+LENGTHS = Lengths(HAND.half_separation, HAND.finger_length, HAND.finger_offset, HAND.tip_radius)
 WIDTH = 0.040
 
 
@@ -43,7 +45,7 @@ def grasp(table: ContactTable) -> Grasp:
     return Grasp(HAND, table, WIDTH)
 
 
-def motion_of(state: GraspState) -> tuple[float, ...]:
+def motion_of(state: GraspState) -> HeldMotion:
     c = HAND.contacts(state.q, state.pose, WIDTH)
     return held_motion(tuple(state.q), tuple(c.d), state.pose[2], 0.0, LENGTHS)
 
@@ -55,13 +57,11 @@ def test_moment_arms_are_the_equilibrium_torques_per_force(grasp, delta):
         state = grasp.steer(state, delta)
     c = HAND.contacts(state.q, state.pose, WIDTH)
     data = grasp.table.data
-    lever1, lever2, *rest = holding_moment_arms(
-        data, data, tuple(c.d), tuple(c.theta), 0.0, motion_of(state)
-    )
+    found = holding_forces(data, data, tuple(c.d), tuple(c.theta), 0.0, motion_of(state))
     forces = grasp.forces(state)
-    assert [lever1, lever2] == pytest.approx(forces.torque / forces.force.mean(), rel=5e-4)
-    shear = forces.tangential.mean()
-    assert rest == pytest.approx([shear, *forces.normal], rel=2e-3, abs=1e-8)
+    assert found.energy_arm == pytest.approx(forces.torque / forces.force.mean(), rel=5e-4)
+    assert found.shear == pytest.approx(forces.tangential.mean(), rel=2e-3, abs=1e-8)
+    assert found.normal == pytest.approx(forces.normal, rel=2e-3, abs=1e-8)
 
 
 def faces(q, d, angle: float, taper: float):
@@ -84,7 +84,7 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
     middle = tips.mean(axis=0)  # Any point can be the reference.
     w = [d[0] - a - n[0] @ (tips[0] - middle), d[1] - a + n[1] @ (tips[1] - middle)]
     s = [(tips[i] - middle) @ t[i] for i in range(2)]
-    arm1, arm2, turn1, turn2, slide, width, across = held_motion(q, d, angle, taper, LENGTHS)
+    motion = held_motion(q, d, angle, taper, LENGTHS)
     for dq in ((1.0, 0.0), (0.0, 1.0), (0.3, -0.8)):
         # The unknowns are (Gx, Gy, φ). In the equations, d_t of each tip is constant, and d of both
         # tips changes by the same amount.
@@ -99,13 +99,13 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
         right = [-rolls[0] * dq[0], -rolls[1] * dq[1], deeper[1] - deeper[0]]
         gx, gy, turned = np.linalg.solve(left, right)
         both = sum(deeper) + (n[1] - n[0]) @ [gx, gy] + (s[0] - s[1]) * turned
-        assert turned == pytest.approx(turn1 * dq[0] - turn2 * dq[1], rel=1e-12)
-        found = arm1 * dq[0] + arm2 * dq[1] + slide * turned
+        assert turned == pytest.approx(motion.turn[0] * dq[0] - motion.turn[1] * dq[1], rel=1e-12)
+        found = motion.arm @ np.array(dq) + motion.slide * turned
         assert found == pytest.approx(both, rel=1e-12, abs=1e-15)
     touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
     along = np.array([math.cos(angle), math.sin(angle)])
-    assert width == pytest.approx((touched[1] - touched[0]) @ along, rel=1e-12)
-    assert across == pytest.approx(width / math.cos(0.5 * taper), rel=1e-12)
+    assert motion.width == pytest.approx((touched[1] - touched[0]) @ along, rel=1e-12)
+    assert motion.across == pytest.approx(motion.width / math.cos(0.5 * taper), rel=1e-12)
 
 
 @pytest.mark.parametrize("taper", [-0.4, 0.2])
@@ -115,16 +115,14 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     a, data = HAND.tip_radius, grasp.table.data
     theta = (angle - 0.5 * taper + q[0], angle + 0.5 * taper - q[1])
     motion = held_motion(q, d, angle, taper, LENGTHS)
-    lever1, lever2, mean, normal1, normal2 = holding_moment_arms(
-        data, data, d, theta, taper, motion
-    )
-    lean = math.tan(0.5 * taper)
-    normal = 0.5 * (normal1 + normal2)
+    held = holding_forces(data, data, d, theta, taper, motion)
+    lean, mean = math.tan(0.5 * taper), held.shear
+    normal = 0.5 * sum(held.normal)
     shear = (mean - lean * normal, mean + lean * normal)
     pressed = (normal + lean * mean, normal - lean * mean)
     looked_up = [lookup(data, d[i], theta[i]) for i in range(2)]
     felt = [sheared_gradient(looked_up[i], d[i], theta[i], shear[i]) for i in range(2)]
-    for i, each in enumerate((normal1, normal2)):
+    for i, each in enumerate(held.normal):
         assert felt[i][0] - shear[i] * math.tan(theta[i]) == pytest.approx(each, rel=1e-4)
     # Sum the contact forces on the object, and the moments that the tips apply to the object.
     forces = [pressed[0] * n[0] - shear[0] * t[0], -pressed[1] * n[1] + shear[1] * t[1]]
@@ -137,7 +135,7 @@ def test_holding_forces_balance_a_tapered_object(grasp, taper):
     force = 0.5 * (looked_up[0][0] + looked_up[1][0])
     torque1 = pressed[0] * n[0] @ v[0] + shear[0] * rolls[0] + felt[0][1]
     torque2 = -pressed[1] * n[1] @ v[1] - shear[1] * rolls[1] - felt[1][1]
-    assert [lever1, lever2] == pytest.approx([torque1 / force, torque2 / force], rel=1e-4)
+    assert held.energy_arm == pytest.approx((torque1 / force, torque2 / force), rel=1e-4)
 
 
 def test_each_tip_has_its_own_table(grasp):
@@ -145,16 +143,18 @@ def test_each_tip_has_its_own_table(grasp):
     stiff = ContactTable.build(Fingertip(0.020), Material.constant(0.6e6)).data
     q1, q2, d1, d2, angle = 0.14, 0.22, 4.0e-3, 2.6e-3, 0.03
 
-    def levers(left, right, q1, q2, d1, d2, angle):
+    def held_by(left, right, q1, q2, d1, d2, angle):
         motion = held_motion((q1, q2), (d1, d2), angle, 0.2, LENGTHS)
         theta = angle - 0.1 + q1, angle + 0.1 - q2
-        return holding_moment_arms(left, right, (d1, d2), theta, 0.2, motion)
+        return holding_forces(left, right, (d1, d2), theta, 0.2, motion)
 
-    here = levers(soft, stiff, q1, q2, d1, d2, angle)
-    mirrored = levers(stiff, soft, q2, q1, d2, d1, -angle)
-    turned = [mirrored[1], mirrored[0], -mirrored[2], mirrored[4], mirrored[3]]
-    assert here == pytest.approx(turned, rel=1e-12)
-    assert here[:2] != pytest.approx(levers(soft, soft, q1, q2, d1, d2, angle)[:2], rel=1e-3)
+    here = held_by(soft, stiff, q1, q2, d1, d2, angle)
+    mirrored = held_by(stiff, soft, q2, q1, d2, d1, -angle)
+    assert here.energy_arm == pytest.approx(mirrored.energy_arm[::-1], rel=1e-12)
+    assert here.shear == pytest.approx(-mirrored.shear, rel=1e-12)
+    assert here.normal == pytest.approx(mirrored.normal[::-1], rel=1e-12)
+    equal_tips = held_by(soft, soft, q1, q2, d1, d2, angle)
+    assert here.energy_arm != pytest.approx(equal_tips.energy_arm, rel=1e-3)
 
 
 def test_total_tilt_is_the_angle_between_normal_and_axis():
@@ -173,10 +173,10 @@ def found_load(
     motion = motion_of(state)
     torque = Grasp(HAND, table, WIDTH).forces(state).torque + more
     data = table.data
-    left1, left2, lever, bow = load_torques(
+    found = load_torques(
         data, data, tuple(c.d), tuple(c.theta), 0.0, motion, (rolled, rolled), tuple(torque)
     )
-    return load_of(0.5 * (left1 + left2), lever, bow)
+    return load_of(0.5 * sum(found.residual), found.arm, found.curvature)
 
 
 @pytest.mark.parametrize("load", [0.0, 4.0, 8.0, -3.0, -6.0])
@@ -203,8 +203,9 @@ def test_moment_arms_and_load_are_zero_without_two_contacts(table):
     data = table.data
     rolled = (0.0, 0.0)
     found = load_torques(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion, rolled, (0.5, 0.5))
-    assert found == (0.0, 0.0, 0.0, 0.0)
-    assert holding_moment_arms(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion) == (0.0,) * 5
+    assert found == ((0.0, 0.0), 0.0, 0.0)
+    held = holding_forces(data, data, (0.0, 1e-3), (0.1, -0.1), 0.0, motion)
+    assert held == ((0.0, 0.0), 0.0, (0.0, 0.0))
 
 
 def test_torques_that_no_load_explains_give_a_finite_load(table):
@@ -212,10 +213,10 @@ def test_torques_that_no_load_explains_give_a_finite_load(table):
         for q in np.linspace(-0.5, 1.0, 7):
             motion = held_motion((q, 0.1), (1e-6, 1e-3), 0.1, 0.3, LENGTHS)
             at = (table.data, table.data, (1e-6, 1e-3), (q, -0.1), 0.3, motion)
-            left1, left2, lever, bow = load_torques(*at, (0.3, 0.3), (torque, 0.5))
-            if lever == 0.0:
+            found = load_torques(*at, (0.3, 0.3), (torque, 0.5))
+            if found.arm == 0.0:
                 continue  # In this pose, the load does not affect torques.
-            load, slope = load_of(0.5 * (left1 + left2), lever, bow)
+            load, slope = load_of(0.5 * sum(found.residual), found.arm, found.curvature)
             assert math.isfinite(load)
             assert slope > 0.0
 
@@ -227,9 +228,9 @@ def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, tap
     theta = (q[0] - 0.5 * taper, 0.5 * taper - q[1])
     data, lean = table.data, math.tan(0.5 * taper)
     motion = held_motion(q, d, angle, taper, LENGTHS)
-    _, _, mean, normal1, normal2 = holding_moment_arms(data, data, d, theta, taper, motion)
-    out = 0.5 * lean * (normal1 + normal2)
-    rolled = (mean - out, mean + out)
+    held = holding_forces(data, data, d, theta, taper, motion)
+    out = 0.5 * lean * sum(held.normal)
+    rolled = (held.shear - out, held.shear + out)
     # Compute the torques from the energies of both tips, each with its own shear.
     v, torques = HAND.tip_jacobian(q), []
     for i, shear in enumerate((rolled[0] + load, rolled[1] - load)):
@@ -240,13 +241,11 @@ def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, tap
         normal = by_d - shear * math.tan(theta[i])
         torque = normal * n @ v[i] + shear * (HAND.tip_radius - d[i] - v[i] @ t) + by_theta
         torques.append(torque if i == 0 else -torque)
-    left1, left2, lever, bow = load_torques(
-        data, data, d, theta, taper, motion, rolled, tuple(torques)
-    )
-    found, _ = load_of(0.5 * (left1 + left2), lever, bow)
+    model = load_torques(data, data, d, theta, taper, motion, rolled, tuple(torques))
+    found, _ = load_of(0.5 * sum(model.residual), model.arm, model.curvature)
     assert found == pytest.approx(load, abs=2e-3)
     # The load must appear in the torques of both joints.
-    assert left1 == pytest.approx(left2, abs=1e-9)
+    assert model.residual[0] == pytest.approx(model.residual[1], abs=1e-9)
 
 
 HANDS = [

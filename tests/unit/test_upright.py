@@ -8,12 +8,12 @@ import pytest
 
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
+from softfinger.kinematics.hand.grasp_state import Lengths
 from softfinger.kinematics.hand.upright import upright_spring
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.plant import CONSTANT, CURRENT, PAPER, WIDTH, make, push_along
 
-# half the distance of the pivots, finger length, finger offset and tip radius [m]
-LENGTHS = (0.05, 0.08, 0.0, 0.02)
+LENGTHS = Lengths(half_separation=0.05, finger=0.08, offset=0.0, radius=0.02)
 START = math.radians(5.0)
 DEPTH, FORCE = 0.0032, 10.0  # indentation [m] and force [N] of the paper's tip
 spring_of = upright_spring.py_func
@@ -21,7 +21,7 @@ spring_of = upright_spring.py_func
 
 def resting_ratio(spring: float) -> float:
     """Return φ/φ0 from the closed form in `kinematics.hand.upright` with c = 2/3."""
-    half_separation, _, _, radius = LENGTHS
+    half_separation, radius = LENGTHS.half_separation, LENGTHS.radius
     inward = half_separation - radius + DEPTH - 0.5 * WIDTH
     b = spring / (FORCE * half_separation)
     line = 2.0 * inward - DEPTH / 3.0 - b * (WIDTH - DEPTH)
@@ -34,8 +34,8 @@ def at_rest(spring: float) -> SimulatedHand:
     hand = make(
         PAPER, object_angle=START, joint_friction=0.0, table_friction=0.0, joint_damping=0.1
     )
-    inwards = LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH
-    full = FORCE * math.sqrt(LENGTHS[1] ** 2 - inwards**2)
+    inwards = LENGTHS.half_separation - LENGTHS.radius + DEPTH - 0.5 * WIDTH
+    full = FORCE * math.sqrt(LENGTHS.finger**2 - inwards**2)
     while hand.t < 8.0:
         torque = full * min(max(hand.t / 5.0, 0.03), 1.0)
         apart = spring * torque / full * 0.5 * (hand.q[0] - hand.q[1])
@@ -48,7 +48,7 @@ def at_rest(spring: float) -> SimulatedHand:
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 4.0])
 def test_sticking_tips_leave_the_object_at_the_angle_of_the_closed_form(share):
-    q = math.asin((LENGTHS[0] - LENGTHS[3] + DEPTH - 0.5 * WIDTH) / LENGTHS[1])
+    q = math.asin((LENGTHS.half_separation - LENGTHS.radius + DEPTH - 0.5 * WIDTH) / LENGTHS.finger)
     spring = share * spring_of(q, DEPTH, FORCE, 2.0 / 3.0, LENGTHS)
     hand = at_rest(spring)
     expected = resting_ratio(spring)
