@@ -65,6 +65,9 @@ _FRICTION_TOLERANCE = 0.1
 _STUCK_TIME = 2.0
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
+# Largest change in a streamed angle that counts as noise [rad]. A larger change moves the joints,
+# which the slip monitor would take for a load.
+_ANGLE_NOISE = 2e-3
 
 
 class ControlState:
@@ -327,7 +330,7 @@ class Control:
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
         change, off = abs(grip.commanded - force), abs(grip.target_angle - angle)
         same_force = change < _FORCE_TOLERANCE * force and not grip.is_dithering
-        same_angle = math.isnan(grip.target_angle) or off < _ANGLE_TOLERANCE
+        same_angle = math.isnan(grip.target_angle) or off < _ANGLE_NOISE
         if isinstance(state, Settled) and not (same_force and same_angle):
             self._enter(Changing(state.history))
 

@@ -117,9 +117,8 @@ class Lease:
     """Exclusive control of the hand by one client.
 
     The lease expires after a period without commands from the client. All unnamed clients share one
-    lease. Commands that can only make the hand safer require no
-    lease. Commands of a task require no lease and end any lease, so every client can take over from
-    a task.
+    lease. Commands that can only make the hand safer require no lease. Commands of a task require
+    no lease and end any lease, so every client can take over from a task.
     """
 
     def __init__(self, seconds: float) -> None:

@@ -38,7 +38,6 @@ from softfinger.daemon.perception.hand_state import (
     TAPER,
     TORQUE,
     TORQUE_NOISE,
-    VELOCITY_TIME,
     D,
     HandFilter,
     HistoryRow,
@@ -136,13 +135,15 @@ def _rates(
 
     The filter uses the rates as derivatives with respect to the latency. Each rate is averaged over
     ±1 standard deviation of the latency, because the joints may have stopped within this interval.
+    The interval is at least one frame period.
     Rates below the velocity resolution are set to 0.
     """
-    span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), VELOCITY_TIME)
+    span_min = 0.5 / h.frame_rate
+    span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), span_min)
     first = _motion_at(history, h.newest_row, scan - span, finger)
     end = min(scan + span, h.t)
     last = _motion_at(history, h.newest_row, end, finger)
-    span = max(end - (scan - span), VELOCITY_TIME)
+    span = max(end - (scan - span), span_min)
     d_rate = (last.d - first.d) / span
     theta_rate = (last.angle - first.angle - sense * (last.q - first.q)) / span
     if abs(d_rate) < h.velocity_unit * h.length:

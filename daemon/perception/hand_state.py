@@ -61,7 +61,7 @@ _WALK_ANGLE = 2e-4  # random walk of the angle due to tip creep [rad]
 _WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
 _WALK_ANGLE_BIAS = 1e-3  # rad
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
-VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
+_VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
 _VARIANCE_MIN = 1e-6  # minimum ratio of measurement variance to predicted variance
 _CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
 _CURRENT_NOISE = 0.02  # additional tolerance for current noise [A]
@@ -305,7 +305,7 @@ def predict(
         for k in range(2):
             h.tip[k].q = h.tip[k].encoder = q[k]
     h.last_closing_speed = h.closing_speed
-    h.closing_speed += (0.5 * (dq[0] + dq[1]) - h.closing_speed) * min(dt / VELOCITY_TIME, 1.0)
+    h.closing_speed += (0.5 * (dq[0] + dq[1]) - h.closing_speed) * min(dt / _VELOCITY_TIME, 1.0)
     _move(h, (dq[0] * dt, dq[1] * dt), dt)
     if h.tip[0].in_contact or h.tip[1].in_contact:
         _add_process_noise(h, dt)
@@ -433,7 +433,7 @@ def _add_rounding_noise(h: HandFilter, finger: int, by: float, turn: float, dt: 
 
     A joint angle error of 1 rad changes d by ``by`` [m] and φ by ``turn`` [rad].
     """
-    variance = h.velocity_unit * h.velocity_unit / 12.0 * VELOCITY_TIME * dt
+    variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
     h.scratch[:] = 0.0
     h.scratch[ENCODER + finger] = 1.0
     h.scratch[ANGLE] = turn
@@ -544,7 +544,7 @@ def _measure_free_torque(
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
-    weight = min(dt / VELOCITY_TIME, 1.0)
+    weight = min(dt / _VELOCITY_TIME, 1.0)
     tip.free_torque += (tip.torque - accelerating - tip.free_torque) * weight
     tip.free_torque_max[0] = max(tip.free_torque_max[0], abs(tip.free_torque))
     if t - tip.window_start > h.frame_age_max:
