@@ -1,7 +1,7 @@
 """Extend mkdocstrings to document record fields, enumeration members and command results.
 
 mkdocstrings reads the sources without importing them. It therefore misses the fields that the
-`softfinger.daemon.wire.fields.record` decorator adds to a record's docstring.
+decorators `record` and `topic` in `softfinger.daemon.wire.fields` add to a record's docstring.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ class FieldDocs(griffe.Extension):
 
     def on_class(self, *, cls: griffe.Class, **_: Any) -> None:
         """Complete the docstring of a record or enumeration."""
-        is_record = any(str(each.value) == "record" for each in cls.decorators)
+        decorators = {each.callable_path.rpartition(".")[2] for each in cls.decorators}
+        is_record = not decorators.isdisjoint(("record", "topic"))
         is_enumeration = any(str(each) in ("IntEnum", "StrEnum") for each in cls.bases)
         if cls.docstring and (is_record or is_enumeration):
             found = getattr(import_module(cls.module.path), cls.name)

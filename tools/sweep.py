@@ -19,10 +19,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -33,6 +34,8 @@ from softfinger.tools.extras import require
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
+Submit = Callable[..., Any]  # starts a function call in a worker, and returns its future
+Completed = Callable[..., Iterator[Any]]  # yields futures as soon as they have completed
 
 # In a checkout, the last three folders are links. These folders must be listed, because a search of
 # the first folder does not follow links.
@@ -142,8 +145,9 @@ class Sweep(Generic[Case, Result]):
         before, workers = -1, processes
         while self._left():
             try:
-                with _pool(workers) if scheduler is None else _cluster(scheduler) as executor:
-                    yield from self._by(executor)
+                chosen = _pool(workers) if scheduler is None else _cluster(scheduler)
+                with chosen as (submit, completed):
+                    yield from self._by(submit, completed)
             except BrokenProcessPool:
                 if len(self._results) > before:
                     before, workers = len(self._results), processes
@@ -156,9 +160,9 @@ class Sweep(Generic[Case, Result]):
                         f"{self._name}: all worker processes exited during {case}"
                     ) from None
 
-    def _by(self, executor: Executor) -> Iterator[int]:
-        futures = {executor.submit(self._work, self._cases[k]): k for k in self._left()}
-        for future in as_completed(futures):
+    def _by(self, submit: Submit, completed: Completed) -> Iterator[int]:
+        futures = {submit(self._work, self._cases[k]): k for k in self._left()}
+        for future in completed(futures):
             self._keep(futures[future], future.result())
             yield len(self._results)
 
@@ -217,27 +221,28 @@ def _exit_with_parent() -> None:
 
 
 @contextmanager
-def _pool(processes: int) -> Iterator[Executor]:
+def _pool(processes: int) -> Iterator[tuple[Submit, Completed]]:
     executor = ProcessPoolExecutor(
         processes,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_prepare_worker,
     )
     try:
-        yield executor
+        yield executor.submit, as_completed
     finally:
         executor.shutdown(wait=False, cancel_futures=True)
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
+def _cluster(address: str) -> Iterator[tuple[Submit, Completed]]:
     require("cluster")
-    from distributed import Client
+    import distributed
 
-    connect: Any = Client
+    dask: Any = distributed
     try:
-        client = connect(address, timeout=_CONNECT_TIMEOUT)
+        client = dask.Client(address, timeout=_CONNECT_TIMEOUT)
     except (OSError, ValueError) as error:
         raise SweepError(f"--scheduler {address}: no Dask scheduler responds: {error}") from None
+    # The executor of Dask fails if a worker dies after a case and before its result is fetched.
     with client:
-        yield client.get_executor()
+        yield partial(client.submit, pure=False), dask.as_completed
