@@ -4,22 +4,7 @@ Frames are precise but late and infrequent; joint readings are frequent but coar
 is held, the estimator predicts the displacement d and the object angle φ from the joint motion. The
 prediction uses the rolling constraints in `hand.grasp_state`. Each frame corrects the predicted
 values. `hand_state` defines and predicts the state. `frame_channels` and `grasp_kernels` update the
-state with measurements.
-
-The object angle φ is the direction of the bisector between the two object faces. The taper α is the
-angle between the faces. The initial value of α is ``object.taper``. The filter updates α with the
-frames of both tips. A shifted sensor has the same effect on the frames as a tapered object. The
-``hand.angle`` limit therefore compares the frames with the setting ``object.taper``.
-
-A disc has no flat faces. For a disc, φ is the direction of the line between the contacts, and
-``rotate`` rotates this line. The line rotates by 2 L sin q/(2R + 2a − d1 − d2) per radian of joint
-angle. With the built-in hand and a disc of radius R = 20 mm, the line rotates by 0.4 rad per radian
-of joint angle. The prediction assumes flat faces, which would rotate by 1.5 rad per radian of joint
-angle. The frames correct the error of the prediction. A rotation of a disc therefore takes longer,
-and the disc rolls further than commanded. For a disc, φ is about 5 % too small, because a curved
-contact appears less tilted than it is. If the fingers are straight or lean outwards, the line does
-not follow the joint motion. A disc with R ≥ 30 mm can be held, but its rotation stops at the tip
-limits.
+state with measurements. `docs/estimation.md` explains the model.
 """
 
 from __future__ import annotations
