@@ -30,7 +30,6 @@ from softfinger.daemon.perception.prior import Prior
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import Contact, Frame, Goal, ObjectPose, Reading
-from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table import ContactTable
 from softfinger.kinematics.estimation.estimator import ContactEstimate
@@ -61,7 +60,7 @@ class HandEstimator:
         hand, gear = settings.hand, settings.servos.gear_ratio
         self._fingers = settings.scene.indices
         self._estimates_object = settings.scene.object_model
-        self._tables = tables[0].data, tables[1].data
+        self._tables = tables
         self._state = state = HandFilter()
         state.half_separation = 0.5 * hand.pivot_separation
         state.length = hand.finger_length
@@ -189,7 +188,7 @@ class HandEstimator:
             ),
             estimate.covariance,
             estimate.systematic,
-            self._tables[finger],
+            self._tables[finger].data,
         ):
             self._invalid[finger] = Invalid.CONTRADICTS_JOINTS
             return
@@ -230,7 +229,9 @@ class HandEstimator:
         pose.valid = in_contact[0] and in_contact[1] and self._estimates_object
         pose.angle = pose.width = 0.0
         if in_contact[0] or in_contact[1]:
-            result = grasp_kernels.write_grasp(self._state.array, *self._tables)
+            result = grasp_kernels.write_grasp(
+                self._state.array, self._tables[0].data, self._tables[1].data
+            )
             tips = result.left, result.right
             if pose.valid:
                 pose.angle, pose.width = result.angle, result.width
@@ -288,11 +289,11 @@ class HandEstimator:
         contact.inside = True
         if not estimate.contact:
             # Noise may hide a light contact.
-            contact.force_std = lookup(table, contact.d_std, 0.0).force
+            contact.force_std = float(table(contact.d_std, 0.0, edge=True).force)
             return
         tilt = total_tilt(contact.theta, contact.tilt_y)
-        found = lookup(table, contact.d, tilt)
-        contact.inside = found.inside
+        found = table(contact.d, tilt, edge=True)
+        contact.inside = bool(found.inside)
         stiff, gain = prior.modulus[1] ** 2, prior.gain[1] ** 2
         if estimate.covariance[3, 3] > 0.0:
             expected = prior.modulus[0] * prior.gain[0]
@@ -300,7 +301,7 @@ class HandEstimator:
             factor_variance = stiff * gain / (stiff + gain)
         else:
             modulus, factor_variance = contact.gain / prior.gain[0], gain
-        contact.force, contact.energy = modulus * found.force, modulus * found.energy
+        contact.force, contact.energy = modulus * float(found.force), modulus * float(found.energy)
         along = contact.theta / tilt if tilt > 0.0 else 0.0
         across = contact.tilt_y / tilt if tilt > 0.0 else 0.0
         by_tilt = found.force_theta

@@ -17,7 +17,6 @@ import numpy as np
 from softfinger.daemon.errors import SoftfingerError
 from softfinger.daemon.simulation.simulated_tactile import StageTouch
 from softfinger.daemon.types import FINGERS
-from softfinger.kinematics.contact.lookup import lookup
 from softfinger.kinematics.contact.table import ContactTable
 
 _CLEARANCE = 1e-3  # distance from the tip at which the plate tilts and waits [m]
@@ -122,18 +121,19 @@ def _press(values: dict[str, float], table: ContactTable, scale: float) -> Plate
     d, theta, pressure = values.get("depth", 0.0), values["tilt"], values.get("pressure", 0.0)
     # Limit the depth to the range in which the contact law is valid at the given tilt.
     d_max = 0.75 * table.tip.radius * (1.0 - abs(math.sin(theta)))
-    known = [(float(x), lookup(table.data, x, theta)) for x in np.linspace(0.0, d_max, 1001)]
-    depths = [x for x, (*_, inside) in known if inside]
-    forces = [scale * float(force) for _, (force, *_, inside) in known if inside]
+    depths = np.linspace(0.0, d_max, 1001)
+    known = table(depths, theta, edge=True)
+    depths, forces = depths[known.inside], scale * known.force[known.inside]
     if "force" in values:
         d = float(np.interp(values["force"], forces, depths, right=math.inf))
-    force, *_, inside = lookup(table.data, d, theta)
-    if d > d_max or not inside:
+    pressed = table(d, theta, edge=True)
+    if d > d_max or not pressed.inside:
         raise PlateError(
             f"press: the load is too large; expected at most {depths[-1] * 1e3:.2f} mm or "
             f"{forces[-1]:.1f} N on this tip at a tilt of {math.degrees(theta):g}°"
         )
-    return PlatePress(d, theta, pressure, scale * float(force), values["speed"], values["hold"])
+    force = scale * float(pressed.force)
+    return PlatePress(d, theta, pressure, force, values["speed"], values["hold"])
 
 
 class Plate:
