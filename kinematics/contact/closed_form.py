@@ -126,7 +126,7 @@ def flatten(*values: ArrayLike) -> tuple[tuple[int, ...], list[FloatArray]]:
     """
     arrays = np.broadcast_arrays(*map(_real, values))
     shape = arrays[0].shape
-    return shape, [np.ascontiguousarray(array).reshape(-1) for array in arrays]
+    return shape, [array.flatten() for array in arrays]
 
 
 def _real(value: ArrayLike) -> FloatArray:

@@ -238,6 +238,11 @@ def forms() -> list[ContactTable]:
     return [ContactTable.build(TIP, CONSTANT), *map(split, SPLITS)]
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_array_of_one_value_causes_no_warning(table):
+    np.testing.assert_equal(table(np.array([2e-3]), 0.1).force, [table(2e-3, 0.1).force])
+
+
 def test_output_shapes_and_types(table):
     halves = np.linspace(-1e-3, 8e-3, 9, dtype=np.float32)
     np.testing.assert_array_equal(
