@@ -53,11 +53,13 @@ from softfinger.daemon.types import FINGERS, Event, Goal, State
 # the position error that joint friction causes with the default settings.
 _ARRIVAL_DISTANCE = 0.03
 # Force tolerance as a fraction of the force target. With simulated sensors, the force noise is 0.3
-# to 0.6 % (1 σ).
+# to 0.6 % (1 σ). A smaller change in a streamed force or a smaller force increase counts as noise.
 _FORCE_TOLERANCE = 0.03
 # Maximum force error due to joint or gear friction, as a fraction of the force target. With the
 # default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
-# integral term removes the friction error within seconds.
+# integral term removes the friction error within seconds. A streamed target may never stop
+# changing, so a grip also counts as settled if the force has reached a setpoint within this
+# tolerance.
 _FRICTION_TOLERANCE = 0.1
 # Time [s] after which a joint that has not reached its goal counts as stuck. After the same time, a
 # force within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the
@@ -65,8 +67,8 @@ _FRICTION_TOLERANCE = 0.1
 _STUCK_TIME = 2.0
 # Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
 _ANGLE_TOLERANCE = math.radians(0.5)
-# Largest change in a streamed angle that counts as noise [rad]. A larger change moves the joints,
-# which the slip monitor would take for a load.
+# Largest change in a streamed angle that counts as noise [rad]. After a larger change, the joints
+# move, and the slip monitor could not distinguish this motion from the effect of a load.
 _ANGLE_NOISE = 2e-3
 
 

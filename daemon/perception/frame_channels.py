@@ -135,8 +135,7 @@ def _rates(
 
     The filter uses the rates as derivatives with respect to the latency. Each rate is averaged over
     ±1 standard deviation of the latency, because the joints may have stopped within this interval.
-    The interval is at least one frame period.
-    Rates below the velocity resolution are set to 0.
+    The interval is at least one frame period. Rates below the velocity resolution are set to 0.
     """
     span_min = 0.5 / h.frame_rate
     span = max(math.sqrt(max(h.covariance[LATENCY, LATENCY], 0.0)), span_min)

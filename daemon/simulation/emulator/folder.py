@@ -82,10 +82,13 @@ class LinkFolder:
             os.close(lock)
 
     def link(self, name: str, target: str) -> None:
-        """Create or replace the link ``name`` to ``target``."""
+        """Create or replace the link ``name`` to ``target`` atomically."""
         link = self.path / name
-        link.unlink(missing_ok=True)
-        link.symlink_to(target)
+        # Without an atomic replacement, a client could find no port while the link is replaced.
+        fresh = self.path / f".{name}.{os.getpid()}"
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(target)
+        fresh.replace(link)
         self._targets[name] = target
 
     def unlink(self, name: str) -> None:
