@@ -27,7 +27,7 @@ tests = "kernels", "pressure_grid"
 files = [f"tests/unit/test_{name}.py" for name in tests]
 files.append("tests/unit/test_estimator_kernels.py::test_activity_matches_plain_numpy")
 files.append("tests/unit/test_table.py::test_tolerance_holds_over_the_whole_domain")
-files.append("tests/unit/test_slip.py::test_one_finger_alone_presses_with_the_requested_force")
+files.append("tests/unit/test_grip_loads.py::test_one_finger_alone_presses_with_the_requested_force")
 failed = pytest.main(["-q", "-n0", "-p", "no:cacheprovider", *files])
 from tests.process.test_plain_numba import figures
 

@@ -14,7 +14,6 @@ from softfinger import Fingertip, Material, SensorGrid
 from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import RecordingError, TactileError
 from softfinger.daemon.perception.finger_model import make_models
-from softfinger.daemon.perception.unloaded_cells import UnloadedCells
 from softfinger.daemon.profile.settings import Settings, TactileSettings
 from softfinger.daemon.profile.validation import plausibility_warnings
 from softfinger.daemon.tactile.replay import ReplayTactile
@@ -522,20 +521,6 @@ def test_the_sensor_of_a_solid_tip_covers_its_base():
     settings = Settings.model_validate({**solid, "tactile": {"rows": 28}})
     (doubt,) = plausibility_warnings(settings)
     assert "but the tip's base is 40 mm wide" in doubt
-
-
-@pytest.mark.parametrize("zero", [0.0, 50.0, 3000.0])
-@pytest.mark.parametrize("noise", [0.7, 5.0, 40.0])
-def test_the_noise_of_a_sensor_as_small_as_its_tip_is_measured_between_frames(zero, noise):
-    rng = np.random.default_rng(5)
-    grid = SensorGrid(24, 24, PITCH)
-    cells = UnloadedCells(grid, 0.020, np.ones(grid.shape, bool))
-    press = 2000.0 * (np.hypot(*(np.indices(grid.shape) - 11.5)) < 5.0)
-    for _ in range(60):
-        frame = zero + press + noise * rng.standard_normal(grid.shape)
-        cells.update(np.clip(np.round(frame), 0, 65535).astype(np.uint16))
-    assert cells.noise == 0.0
-    assert cells.scatter == pytest.approx(noise, rel=0.2, abs=0.4)
 
 
 def test_a_recording_needs_an_existing_folder(tmp_path):

@@ -107,6 +107,7 @@ def test_the_material_of_each_tip_reaches_estimate_table_and_prediction(settings
         left, right = daemon.models
         assert left.material.reference_modulus == pytest.approx(LEFT)
         assert not right.material.is_linear
+        assert left.prior.modulus == (pytest.approx(1.0), pytest.approx(0.05, rel=0.2))
         loop = daemon.loop
         loop.advance(0.3)
         loop.command({"command": "arm"})
@@ -228,3 +229,13 @@ def test_a_cell_with_a_large_zero_offset_does_not_saturate_the_others(stuck, tmp
     given = counting()
     made = make_estimator(given, make_material(given.material), 0, None, calibration)
     assert made.saturation == expected
+
+
+def test_a_tare_reduces_the_noise_of_the_zero_offsets_to_a_quarter(tmp_path):
+    calibrated(tmp_path / "left.json", np.zeros((44, 44)))
+    given = counting(calibration=(str(tmp_path / "left.json"), ""), noise=6.0 * PASCAL_PER_COUNT)
+    bench = Bench(given)
+    bench.tare(60.0)
+    zero = bench.perception._converter.zero
+    assert zero.mean() == pytest.approx(60.0, abs=0.2)
+    assert zero.std() == pytest.approx(6.0 / 4.0, rel=0.2)

@@ -232,6 +232,7 @@ SEQUENCES: dict[str, tuple[Callable[[], list[float]], bool]] = {
         False,
     ),
     "sixty again": (lambda: [*range(60), *range(20)], True),
+    "150 again": (lambda: [*range(150), *range(20)], True),
     "again, but longer ago than is remembered": (lambda: [*range(300), *range(20)], False),
 }
 
@@ -241,6 +242,16 @@ def test_only_a_recurring_order_is_a_repetition(name: str) -> None:
     frames, expected = SEQUENCES[name]
     assert given(RepeatDetector(100.0, 10.0), frames()) is expected
     assert not given(RepeatDetector(100.0, 10.0, enabled=False), frames())
+
+
+@pytest.mark.parametrize(("changing", "is_repetition"), [(3, False), (5, True)])
+def test_a_repetition_is_recognised_by_several_changing_cells(changing, is_repetition):
+    repeats = RepeatDetector(100.0, 10.0)
+    for number in [1, 2] * 50:
+        frame = np.zeros(8, np.uint16)
+        frame[:changing] = number
+        repeats.update(frame)
+    assert repeats.is_fault == is_repetition
 
 
 def test_rejected_frames_are_forgotten_after_the_grip():
