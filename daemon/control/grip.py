@@ -92,6 +92,11 @@ class Grip:
         return self._state.law.is_blind
 
     @property
+    def angle_std(self) -> float:
+        """Standard deviation of the estimated object angle [rad]."""
+        return self._grasp.angle_std
+
+    @property
     def is_dithering(self) -> bool:
         """True while dither moves the object upright, or while the dither has not started yet."""
         state = self._state

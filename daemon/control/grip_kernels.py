@@ -25,7 +25,8 @@ FloatArray = NDArray[np.float64]
 
 _TORQUE_ERROR_SIGMA = 2.0  # force margin, in standard deviations of the torque constant
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
-_DISTRIBUTE_ANGLE = 3e-3  # maximum object rotation while the tip forces are equalised [rad]
+# Tolerance of the object angle [rad]. The noise of simulated sensors is 0.5 to 2 mrad (1 σ).
+ANGLE_TOLERANCE = math.radians(0.5)
 _STIFFNESS_MIN = 100.0  # lower limit of the stiffness, which is used as a divisor [N/m]
 ROTATION_MIN = 0.1  # minimum ratio of object rotation to antisymmetric joint angle
 
@@ -261,14 +262,14 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
 
     The force controller acts only on the mean tip force. To equalise the forces, both fingers
     rotate by a small angle in the same direction. The object then rotates by at most
-    _DISTRIBUTE_ANGLE.
+    ANGLE_TOLERANCE.
     """
     off = (
         0.5
         * (grasp.normal[0] - grasp.normal[1])
         / (_mean_stiffness(grasp) * mean(grasp.moment_arm))
     )
-    limit = _DISTRIBUTE_ANGLE / _rotation_per_offset(grasp)
+    limit = ANGLE_TOLERANCE / _rotation_per_offset(grasp)
     balance_offset = clip(
         g.balance_offset - 2.0 * math.pi * _DISTRIBUTE_BANDWIDTH * off * g.law.dt, limit
     )

@@ -10,7 +10,7 @@ Travelling   MOVING     joints move to commanded angles  arrived, or timed out �
                                                          `grasp`, `hold` → Approaching
              RELEASING  joints move to the open angles   arrived, or timed out → Armed
 Approaching  GRASPING   fingers close; the first one to  all touch → Pressing; at the joint limits
-                        touch waits for the other        for _STUCK_TIME → Armed
+                        touch waits for the other        for ten settling times → Armed
 Pressing     GRASPING   the force increases              force reached → Settled, then Turning if
                                                          an angle was commanded
 Settled      HOLDING    force and angle are constant:    `grasp`, `hold`, `limit_force` with
@@ -44,8 +44,10 @@ from dataclasses import dataclass, field
 
 from softfinger.daemon.control.fingers import Fingers
 from softfinger.daemon.control.grip import Grip
+from softfinger.daemon.control.grip_kernels import ANGLE_TOLERANCE
 from softfinger.daemon.control.modes import Mode
 from softfinger.daemon.perception.grasp import GraspState
+from softfinger.daemon.perception.hand_state import GATE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Event, Goal, State
 
@@ -61,15 +63,6 @@ _FORCE_TOLERANCE = 0.03
 # changing, so a grip also counts as settled if the force has reached a setpoint within this
 # tolerance.
 _FRICTION_TOLERANCE = 0.1
-# Time [s] after which a joint that has not reached its goal counts as stuck. After the same time, a
-# force within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the
-# settling time of the force in a hand without friction.
-_STUCK_TIME = 2.0
-# Angle tolerance [rad]. With simulated sensors, the angle noise is 0.5 to 2 mrad (1 σ).
-_ANGLE_TOLERANCE = math.radians(0.5)
-# Largest change in a streamed angle that counts as noise [rad]. After a larger change, the joints
-# move, and the slip monitor could not distinguish this motion from the effect of a load.
-_ANGLE_NOISE = 2e-3
 
 
 class ControlState:
@@ -189,6 +182,9 @@ class Control:
         # for this time. The settling time is twice `control.smooth_time` because the setpoints are
         # averaged twice.
         self._settling_time = 2.0 * settings.control.smooth_time
+        # A joint that has not reached its goal after this time counts as stuck [s]. After the same
+        # time, a force within _FRICTION_TOLERANCE of its target counts as reached.
+        self._stuck_time = 10.0 * self._settling_time
 
     @property
     def mode(self) -> Mode:
@@ -327,12 +323,16 @@ class Control:
     def _change(self, state: Gripping) -> None:
         """Leave the Settled state if the commanded force or angle has changed significantly.
 
+        After a significant change, the joints move, and the slip monitor could not distinguish
+        this motion from the effect of a load. A change of the angle is significant if it exceeds
+        three standard deviations of the estimated angle.
+
         Any force command restarts the dither of the upright law, which also moves the joints.
         """
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
         change, off = abs(grip.commanded - force), abs(grip.target_angle - angle)
         same_force = change < _FORCE_TOLERANCE * force and not grip.is_dithering
-        same_angle = math.isnan(grip.target_angle) or off < _ANGLE_NOISE
+        same_angle = math.isnan(grip.target_angle) or off <= GATE * grip.angle_std
         if isinstance(state, Settled) and not (same_force and same_angle):
             self._enter(Changing(state.history))
 
@@ -393,7 +393,7 @@ class Control:
         off = self.fingers.distance_max
         if off < _ARRIVAL_DISTANCE:
             self._enter_armed()
-        elif state.arrived_for > _STUCK_TIME:
+        elif state.arrived_for > self._stuck_time:
             text = f"{state.mode.value}: stopped {math.degrees(off):.1f}° before the goal"
             self._warn("short", text)
             self.fingers.hold_here()
@@ -409,7 +409,7 @@ class Control:
                 self._enter(Pressing(GripHistory(), command=state.command))
         elif self.fingers.advance_setpoints(self._settings.control.approach_speed):
             state.arrived_for += dt
-            if state.arrived_for > _STUCK_TIME:
+            if state.arrived_for > self._stuck_time:
                 off = self.fingers.distance_max
                 where = "at" if off < _ARRIVAL_DISTANCE else f"{math.degrees(off):.1f}° before"
                 self._warn("grasp", f"the fingers found no object and stopped {where} their limits")
@@ -471,12 +471,12 @@ class Control:
         is_reached = True
         if not isinstance(state, Pressing):
             self._end_turn_before_slip(history)
-            is_reached = not abs(pose.angle - grip.target_angle) >= _ANGLE_TOLERANCE  # True for NaN
+            is_reached = not abs(pose.angle - grip.target_angle) >= ANGLE_TOLERANCE  # True for NaN
         if not isinstance(state, Turning):
             streamed = isinstance(state, Pressing) and state.command.is_streamed
             near = abs(self.fingers.force - grip.target) < _FRICTION_TOLERANCE * grip.target
             state.near_for = state.near_for + dt if near and not grip.is_dithering else 0.0
-            stuck = state.near_for > _STUCK_TIME
+            stuck = state.near_for > self._stuck_time
             is_reached = is_reached and (stuck or self._is_force_reached(streamed))
         state.reached_for = state.reached_for + dt if is_reached else 0.0
         if state.reached_for <= self._settling_time:

@@ -39,7 +39,7 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 # Standard deviations of two settings
 _TAPER_ERROR = 0.1  # `object.taper` [rad]
 _LATENCY_ERROR = 0.03  # `tactile.latency` [s]
-_GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
+GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
 
 
 class HandEstimator:
@@ -83,10 +83,13 @@ class HandEstimator:
         state.is_single = len(self._fingers) == 1
         state.gain_is_known = settings.estimator.free_gain is False
         state.t = -math.inf
+        # Without `tip.relaxation`, the rubber may lose a part of the estimated force in a hold.
+        relaxation_error = 0.0 if any(settings.tip.relaxation) else states.MODEL_ERROR
         ratios = np.linspace(1e-3, 1.0, LAW_POINTS)
         for finger, table in enumerate(tables):
             law = 0.0 if materials is None else materials[finger].force_error(ratios)
-            state.tip[finger].law_error[:] = np.hypot(law, table.max_error)
+            known = math.hypot(table.max_error, relaxation_error)
+            state.tip[finger].law_error[:] = np.hypot(law, known)
             state.tip[finger].relaxation = 1.0 + sum(settings.tip.relaxation)
         if priors is None:
             priors = make_prior(settings, None), make_prior(settings, None)
@@ -324,4 +327,4 @@ def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:
     """Return the goal current [A] if the joint is far from its goal, otherwise 0."""
-    return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0
+    return goal.current[finger] if goal.q[finger] - q > GOAL_DISTANCE else 0.0

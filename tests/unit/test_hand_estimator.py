@@ -129,8 +129,10 @@ def test_systematic_errors_do_not_average_out():
     # The force error results from the errors of d, θ and the modulus. The derivatives are ∂F/∂d =
     # 2F/d and ∂F/∂θ = F tan θ, and the modulus error is 20 %.
     by_d, by_theta = 2.0 * contact.force / contact.d * contact.d_std, contact.force * 0.1 * 4e-3
-    by_modulus = 0.2 * contact.force
-    assert contact.force_std == pytest.approx(math.hypot(by_d, by_theta, by_modulus), rel=0.02)
+    # The rubber may relax by 5 %.
+    by_modulus, by_relaxation = 0.2 * contact.force, 0.05 * contact.force
+    expected = math.hypot(by_d, by_theta, by_modulus, by_relaxation)
+    assert contact.force_std == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.filterwarnings("ignore:the material law deviates")
@@ -165,7 +167,10 @@ def test_a_frame_with_a_fixed_gain_measures_the_product_of_force_and_gain(
     fixed = replace(ESTIMATE, covariance=np.diag([1e-12, 1e-12, 0.0, 0.0]))
     estimator.update(0, frame(5.0), fixed, contact)
     assert contact.force == pytest.approx(table(0.003, 0.1).force / 1.4)
-    assert contact.force_std == pytest.approx(gain_error * contact.force, rel=0.01)
+    # Without `tip.relaxation`, the rubber may relax by 5 %.
+    assert contact.force_std / contact.force == pytest.approx(
+        math.hypot(gain_error, 0.05), rel=0.01
+    )
 
 
 def frame(t: float) -> Frame:

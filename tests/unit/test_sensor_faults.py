@@ -73,7 +73,7 @@ def test_a_gain_change_at_one_solid_tip_is_named_and_has_no_effect(over):
     """The frames of a solid tip measure only the product of force and gain."""
     with Hand(SOLID) as hand:
         grasped(hand, FORCE)
-        hand.plant.measurement_faults[0].begin("gain", 0.6, hand.plant.t, over)
+        hand.plant.measurement_faults[0].begin("gain", 0.5, hand.plant.t, over)
         seen = hand.watch(over + 2.0)
         assert {kind for _, kind, _ in hand.events if kind.startswith("consistency")} == {
             "consistency.left_sensor"

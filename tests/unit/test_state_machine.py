@@ -23,6 +23,7 @@ class Machine:
         grasp.moment_arm, grasp.energy_arm = [0.079, 0.079], [0.079, 0.079]
         grasp.jacobian_rotation, grasp.stiffness = [0.75, 0.75], [6e3, 6e3]
         grasp.d, grasp.normal = [4e-3, 4e-3], [FORCE, FORCE]
+        grasp.angle_std = 7e-4
         self.grasp = grasp
         self.control = Control(Settings(), self.state, grasp)
         self.control.arm()
