@@ -90,9 +90,9 @@ class Contact:
     nis_footprint: float = 1.0
     nis_amplitude: float = 1.0
     misfit: bool = False  # True if the model does not fit the frame; d and theta may be biased
-    force: float = 0.0  # normal force from the table, modulus_scale · F(d, total tilt) [N]
+    force: float = 0.0  # elastic tip force, modulus_scale · relaxation · F(d, total tilt) [N]
     energy: float = 0.0  # modulus_scale · U(d, total tilt) [J]
-    force_std: float = 0.0  # standard deviation [N], including table and material-law errors
+    force_std: float = 0.0  # standard deviation [N], including table, material law and relaxation
     shear_x: float = 0.0  # shear force from the newest frame of a solid tip [N]
     shear_y: float = 0.0
     inside: bool = True  # True if (d, θ) is inside the model's domain

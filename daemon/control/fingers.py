@@ -7,10 +7,14 @@ import math
 from softfinger.daemon.control.grip_kernels import ROTATION_MIN
 from softfinger.daemon.control.setpoint import Setpoint, SetpointState
 from softfinger.daemon.perception.grasp import GraspState
-from softfinger.daemon.perception.hand_estimator import GOAL_DISTANCE
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import FINGERS, Goal, State
 
+# Distance from the joint angle to the goal angle under torque control [rad]. If the distance is at
+# least 0.25 rad, the motor current limit determines the torque (see `hand_estimator`). The distance
+# is smaller than `safety.goal_reach`, so the goal may jump from one side of the joint angle to the
+# other.
+_GOAL_OFFSET = 0.35
 # Margin between the maximum tilt during a rotation and the tilt that triggers a fault [rad].
 _TILT_RESERVE = 0.1
 
@@ -32,10 +36,6 @@ class Fingers:
         self._settings, self._contacts = settings, state.contacts
         dt, smooth = 1.0 / settings.loop.rate, settings.control.smooth_time
         self._setpoints = [Setpoint(dt, smooth, SetpointState()) for _ in FINGERS]
-        # Distance from the joint angle to the goal angle under torque control [rad]. Beyond
-        # GOAL_DISTANCE, the current limit determines the torque. Within `safety.goal_reach`, the
-        # goal may jump from one side of the joint angle to the other.
-        self._goal_offset = 0.5 * (GOAL_DISTANCE + settings.safety.goal_reach)
 
     # Contacts
 
@@ -133,5 +133,5 @@ class Fingers:
         """Set goals that produce joint ``torques`` [N·m]; positive torques close the fingers."""
         for index in self.indices:
             current = torques[index] / self._settings.control.torque_constant
-            goal.q[index] = self.reading.q[index] + math.copysign(self._goal_offset, current)
+            goal.q[index] = self.reading.q[index] + math.copysign(_GOAL_OFFSET, current)
             goal.current[index] = abs(current)

@@ -88,7 +88,7 @@ class Grip:
 
     @property
     def is_blind(self) -> bool:
-        """True if the control law does not use the object angle."""
+        """True for the `upright` law, which uses the object angle only after a target is set."""
         return self._state.law.is_blind
 
     @property
@@ -105,7 +105,10 @@ class Grip:
 
     @property
     def stopping_ratio(self) -> float:
-        """Ratio of the smallest possible stop angle to the angle, or 0 if |angle| is not rising."""
+        """Ratio of the angle at which a rotation that stops now would end, to the present angle.
+
+        The ratio is 0 unless the angle setpoint is moving away from 0.
+        """
         angle, speed = self.angle.value, self.angle.speed
         if speed * angle <= 0.0:
             return 0.0

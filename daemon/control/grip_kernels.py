@@ -45,14 +45,14 @@ class GripLaw(Record):
     friction_speed: float  # joint speed above which friction is fully compensated [rad/s]
     torque_error: float  # relative error of the torque constants
     turn_decay: float  # factor that reduces the rotation rate on each tick without a frame
-    is_blind: bool  # True for the `upright` law, which uses dither instead of angle measurements
+    is_blind: bool  # True for the `upright` law, which uses dither until a target angle is set
     half_separation: float  # half the pivot separation [m]
     length: float  # finger length [m]
     offset: float  # fingertip offset [m]
     radius: float  # tip radius [m]
     dither_torque: float  # [N·m]
     dither_rate: float  # [rad/s]
-    dither_time: float  # dither duration [s]
+    dither_time: float  # duration of the dither, whose amplitude falls to 0 [s]
 
 
 class GripState(Record):
@@ -227,12 +227,12 @@ def _grip_force(g: GripState, target: float, measured: float, limit: float) -> f
 
 @inner_kernel
 def _force_limit(g: GripState, arm: float, free_torque: float, load: float) -> float:
-    """Return an upper limit for the grip force [N], independent of the tactile readings.
+    """Return an upper limit for the grip force [N].
 
-    The limit is the target force plus three margins. The margins cover the torque constant error,
-    the joint friction and the torque ``load`` [N·m] that the detected load causes. ``arm`` is the
-    moment arm of the grip force [m], and ``free_torque`` is the maximum joint torque during the
-    approach [N·m].
+    The limit does not depend on the measured force. It is the target force plus three margins. The
+    margins cover the torque constant error, the joint friction and the torque ``load`` [N·m] that
+    the detected load causes. ``arm`` is the moment arm of the grip force [m], and ``free_torque``
+    is the maximum joint torque during the approach [N·m].
     """
     force: float = g.force.target * (1.0 + _TORQUE_ERROR_SIGMA * g.law.torque_error)
     friction = slip_monitor.coulomb_friction(g.slip, free_torque)
@@ -261,7 +261,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
     """Equalise the tip forces if friction between the object and its support unbalances them.
 
     The force controller acts only on the mean tip force. To equalise the forces, both fingers
-    rotate by a small angle in the same direction. The object then rotates by at most
+    rotate by a small angle in the same direction. The object then rotates by at most half of
     ANGLE_TOLERANCE.
     """
     off = (
@@ -269,7 +269,7 @@ def _distribute(g: GripState, grasp: GraspState) -> None:
         * (grasp.normal[0] - grasp.normal[1])
         / (_mean_stiffness(grasp) * mean(grasp.moment_arm))
     )
-    limit = ANGLE_TOLERANCE / _rotation_per_offset(grasp)
+    limit = 0.5 * ANGLE_TOLERANCE / _rotation_per_offset(grasp)
     balance_offset = clip(
         g.balance_offset - 2.0 * math.pi * _DISTRIBUTE_BANDWIDTH * off * g.law.dt, limit
     )

@@ -5,12 +5,16 @@ define the symbols.
 
     r         low-pass filtered torque residual of each joint; r̄ is the mean of both joints
     L         load per tip: r̄ − offset = load_arm L + load_curvature L²               (`load_of`)
-    load      min(4 max(|L| − joint_friction/(2 load_arm), 0), |L| + joint_friction/slope), with
-              slope = load_arm + 2 load_curvature L
-    needed    max(load, pull, object_load/2)/usable_friction, stored as `needed_force`. `pull` is
-              the pulling force [N] that solid tips measure; usable_friction is tip_friction
-              (1 − margin) − `grasp.shear`, but at least _SPARE_MIN tip_friction.
+    load      min(4 max(|L| − joint_friction/(2 load_arm), 0), |L| + joint_friction/slope,
+              tip_friction force_limit), with slope = load_arm + 2 load_curvature L
+    assumed   max(load, pull, object_load/2), stored as `assumed_load`; `pull` is the pulling force
+              [N] that solid tips measure
+    needed    assumed/usable_friction, stored as `needed_force`; usable_friction is tip_friction
+              (1 − margin) − `grasp.shear`, but at least _SPARE_MIN tip_friction
     force     min(max(commanded, needed), force_limit)
+
+If friction could hide a load that is too large for the grip, `load` is 0. For solid tips, `load` is
+limited to the measured shear.
 
 **Offset.** Gear friction, modulus errors and torque constant errors cause a residual even without a
 load. The offset is measured when a hold begins, and again after the force or the angle has changed.
@@ -19,7 +23,7 @@ slowly, with a time constant of up to _SETTLING_TIME. If the commanded torque of
 changes, friction balances the change. The offset then follows the change with the time constant of
 r̄. Joint friction can explain an initial offset of up to ±`joint_friction`; `start_offset` is the
 part beyond this range. The offset stays within ±`joint_friction` of `start_offset`. Because rubber
-relaxes, the lower end of the range is extended by GATE MODEL_ERROR (15 %) of the tip moment.
+relaxes, the lower end of the range is extended by GATE RELAXATION_ERROR (21 %) of the tip moment.
 
 **Load.** Friction hides loads of up to joint_friction/load_arm, which is 2 N per tip for the
 built-in hand. Loads below half of this value are ignored. The estimate of a larger load is
@@ -48,7 +52,8 @@ from __future__ import annotations
 import math
 
 from softfinger.daemon.perception.grasp import GraspState
-from softfinger.daemon.perception.hand_state import AGREEMENT, GATE, MODEL_ERROR, OUTLIER_GATE
+from softfinger.daemon.perception.hand_state import AGREEMENT, GATE, OUTLIER_GATE
+from softfinger.daemon.perception.prior import RELAXATION_ERROR
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import GRIP_FRACTION
@@ -60,6 +65,7 @@ _AVERAGE_TIME = 0.1  # averaging time [s]; velocity readings fluctuate by one co
 _SETTLING_TIME = 1.0  # settling time of the residual, and hold time of a force increase [s]
 _DECAY_TIME = 2.0  # time to reduce the force by `grip_raise_max`, and decay time of rotations [s]
 _SUDDEN_SHARE = 0.7  # minimum sudden load, as a fraction of the usable friction force
+_SHEAR_JUMP = 0.6  # smallest significant shear jump at solid tips [N]; equals 6 σ of the noise
 _UNCONFIRMED_SHARE = 0.3  # maximum force increase without confirmation, as a fraction of the force
 ARM_MIN = 0.1  # minimum moment arm, as a fraction of the finger length
 _SPARE_MIN = 0.3  # minimum usable fraction of the friction coefficient
@@ -69,7 +75,6 @@ class SlipLaw(Record):
     """Constants of a slip monitor."""
 
     dt: float  # [s]
-    ticks_per_frame: float
     width: float  # object width [m]
     arm_min: float  # minimum moment arm [m]
     yield_speed: float  # minimum speed change of a joint that yields to a load [rad/s]
@@ -106,9 +111,8 @@ class SlipState(Record):
     load: float  # load per tip, including the part hidden by friction [N]
     assumed_load: float  # largest of `load`, the measured shear and half the declared load [N]
     is_confirmed: bool  # True if a load may increase the force by more than _UNCONFIRMED_SHARE
-    shear: Pair  # average pulling and twisting forces measured by solid tips [N]
-    last_shear: Pair  # pulling and twisting forces on the previous tick [N]
-    shear_variance: Pair  # variances of the measured pulling and twisting forces [N²]
+    pull: float  # average pulling force measured by solid tips [N]
+    twist: float  # average twisting force measured by solid tips [N]
     usable_friction: float  # friction coefficient, reduced by the slip margin and by rolling
     rotation_seen: Pair  # value of `unexplained_rotation` at the previous update [rad]
     rotation: Pair  # unexplained rotation per tip during the last _DECAY_TIME [rad]
@@ -124,7 +128,6 @@ def configure(s: SlipState, settings: Settings) -> None:
     """Set the constants from the settings."""
     law, control = s.law, settings.control
     law.dt = 1.0 / settings.loop.rate
-    law.ticks_per_frame = settings.loop.rate / settings.tactile.rate
     law.width = settings.object.width
     law.arm_min = ARM_MIN * settings.hand.finger_length
     law.yield_speed = 0.5 * VELOCITY_UNIT / settings.servos.gear_ratio
@@ -149,9 +152,8 @@ def reset(s: SlipState) -> None:
     s.is_watched = s.is_confirmed = s.has_turned = s.reflex_triggered = False
     s.joint_friction = s.offset = s.start_offset = s.deviation = s.moment = s.holding_time = 0.0
     s.balanced_torque = 0.0
-    s.load = s.assumed_load = 0.0
+    s.load = s.assumed_load = s.pull = s.twist = 0.0
     s.residual[:] = s.variance[:] = s.speed[:] = s.q[:] = 0.0
-    s.shear[:] = s.last_shear[:] = s.shear_variance[:] = 0.0
     s.rotation_seen[:] = s.rotation[:] = 0.0
     s.needed_force = s.force_limit = s.balanced_max = s.idle_time = 0.0
 
@@ -235,7 +237,7 @@ def update(
     if law.tip_friction * commanded * grasp.load_arm <= s.joint_friction:
         s.load = 0.0
     if law.has_shear:  # Any load beyond the measured shear is due to a force error.
-        s.load = min(s.load, pull + OUTLIER_GATE * math.sqrt(s.shear_variance[0]))
+        s.load = min(s.load, pull + _SHEAR_JUMP)
     if grasp.sensor_fault:
         s.load = pull = s.needed_force = 0.0
         s.has_turned = sudden = s.is_confirmed = False
@@ -377,25 +379,14 @@ def _has_jumped(
 def _detect_shear_jump(
     s: SlipState, pull: float, twist: float, is_held: bool, sudden_min: float
 ) -> bool:
-    """Average the shear loads [N] that solid tips measure; return True if a load jumped.
-
-    A jump counts if it exceeds OUTLIER_GATE standard deviations of the measured shear.
-    """
-    shear = pull, twist
-    sudden = False
-    for k in range(2):
-        jump = shear[k] - s.shear[k]
-        is_rising = jump * shear[k] > 0.0
-        noise = OUTLIER_GATE * math.sqrt(s.shear_variance[k])
-        if is_held and is_rising and abs(jump) > noise and abs(shear[k]) > sudden_min:
-            sudden = True
-        # The shear changes only with a frame. A change has twice the variance of the shear.
-        change = shear[k] - s.last_shear[k]
-        square = 0.5 * change * change * s.law.ticks_per_frame
-        s.shear_variance[k] += (square - s.shear_variance[k]) * s.law.dt / _SETTLING_TIME
-        s.shear[k] += jump * s.law.dt / _AVERAGE_TIME
-        s.last_shear[k] = shear[k]
-    return sudden
+    """Average the shear loads [N] that solid tips measure; return True if a load jumped."""
+    pull_jump = pull - s.pull
+    twist_jump = twist - s.twist
+    s.pull += pull_jump * s.law.dt / _AVERAGE_TIME
+    s.twist += twist_jump * s.law.dt / _AVERAGE_TIME
+    pulled = pull_jump > _SHEAR_JUMP and pull > sudden_min
+    twisted = abs(twist_jump) > _SHEAR_JUMP and abs(twist) > sudden_min
+    return is_held and (pulled or twisted)
 
 
 @inner_kernel
@@ -441,7 +432,7 @@ def _update_offset(s: SlipState, grasp: GraspState, residual: float, torque_chan
     step = s.balanced_torque * law.dt / _AVERAGE_TIME  # The residual is averaged in the same way.
     s.balanced_torque -= step
     s.offset += step
-    relaxation = GATE * MODEL_ERROR * _moment(grasp)
+    relaxation = GATE * RELAXATION_ERROR * _moment(grasp)
     deviation = residual - s.offset
     if -s.joint_friction - relaxation < deviation < s.joint_friction:
         s.offset += deviation * law.dt / s.holding_time

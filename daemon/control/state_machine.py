@@ -10,7 +10,7 @@ Travelling   MOVING     joints move to commanded angles  arrived, or timed out �
                                                          `grasp`, `hold` → Approaching
              RELEASING  joints move to the open angles   arrived, or timed out → Armed
 Approaching  GRASPING   fingers close; the first one to  all touch → Pressing; at the joint limits
-                        touch waits for the other        for ten settling times → Armed
+                        touch waits for the other        for _STUCK_TIME → Armed
 Pressing     GRASPING   the force increases              force reached → Settled, then Turning if
                                                          an angle was commanded
 Settled      HOLDING    force and angle are constant:    `grasp`, `hold`, `limit_force` with
@@ -57,12 +57,19 @@ _ARRIVAL_DISTANCE = 0.03
 # Force tolerance as a fraction of the force target. With simulated sensors, the force noise is 0.3
 # to 0.6 % (1 σ). A smaller change in a streamed force or a smaller force increase counts as noise.
 _FORCE_TOLERANCE = 0.03
-# Maximum force error due to joint or gear friction, as a fraction of the force target. With the
+# Force error that joint or gear friction may cause, as a fraction of the force target. With the
 # default finger, a friction torque of 0.05 N·m causes an error of 10 % at a force of 6 N. The
 # integral term removes the friction error within seconds. A streamed target may never stop
-# changing, so a grip also counts as settled if the force has reached a setpoint within this
-# tolerance.
+# changing. For a streamed force, it is sufficient that the force follows the setpoint and that the
+# setpoint is within this tolerance of the target.
 _FRICTION_TOLERANCE = 0.1
+# Time [s] after which a joint that has not reached its goal counts as stuck. After the same time, a
+# force within _FRICTION_TOLERANCE of its target counts as reached. _STUCK_TIME is ten times the
+# settling time of the force in a hand without friction.
+_STUCK_TIME = 2.0
+# Largest change in a streamed angle that counts as noise [rad]. After a larger change, the joints
+# move, and the slip monitor could not distinguish this motion from the effect of a load.
+_ANGLE_NOISE = 2e-3
 
 
 class ControlState:
@@ -179,12 +186,9 @@ class Control:
         # A grip counts as empty if the tips have appeared to touch each other for this long [s].
         self._empty_time = settings.safety.frame_age_hold / settings.tactile.rate
         # Settling time [s]. Force and angle count as settled when they have stayed at their targets
-        # for this time. The settling time is twice `control.smooth_time` because the setpoints are
-        # averaged twice.
+        # for this time. A setpoint moves on for 1.5 `control.smooth_time` after its target has
+        # stopped, because the setpoint is averaged twice.
         self._settling_time = 2.0 * settings.control.smooth_time
-        # A joint that has not reached its goal after this time counts as stuck [s]. After the same
-        # time, a force within _FRICTION_TOLERANCE of its target counts as reached.
-        self._stuck_time = 10.0 * self._settling_time
 
     @property
     def mode(self) -> Mode:
@@ -323,16 +327,12 @@ class Control:
     def _change(self, state: Gripping) -> None:
         """Leave the Settled state if the commanded force or angle has changed significantly.
 
-        After a significant change, the joints move, and the slip monitor could not distinguish
-        this motion from the effect of a load. A change of the angle is significant if it exceeds
-        three standard deviations of the estimated angle.
-
         Any force command restarts the dither of the upright law, which also moves the joints.
         """
         grip, force, angle = self.grip, state.history.settled_force, state.history.settled_angle
         change, off = abs(grip.commanded - force), abs(grip.target_angle - angle)
         same_force = change < _FORCE_TOLERANCE * force and not grip.is_dithering
-        same_angle = math.isnan(grip.target_angle) or off <= GATE * grip.angle_std
+        same_angle = math.isnan(grip.target_angle) or off < _ANGLE_NOISE
         if isinstance(state, Settled) and not (same_force and same_angle):
             self._enter(Changing(state.history))
 
@@ -377,8 +377,9 @@ class Control:
             return state.current
         if not isinstance(state, Approaching):
             return self._settings.safety.current_move
-        # The tip may reach the object before the sensor detects contact. Limit the current so that
-        # the tip force can't exceed the commanded force.
+        # The tip may reach the object before the sensor detects contact. Limit the tip force to
+        # half of the commanded force. The other half is a reserve for a wrong torque constant and
+        # for the momentum of the finger.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
         # The joint friction may exceed the setting. Therefore, also allow for `free_torque`, the
         # friction torque measured in free motion. Otherwise, the joint might not move at the
@@ -393,7 +394,7 @@ class Control:
         off = self.fingers.distance_max
         if off < _ARRIVAL_DISTANCE:
             self._enter_armed()
-        elif state.arrived_for > self._stuck_time:
+        elif state.arrived_for > _STUCK_TIME:
             text = f"{state.mode.value}: stopped {math.degrees(off):.1f}° before the goal"
             self._warn("short", text)
             self.fingers.hold_here()
@@ -409,7 +410,7 @@ class Control:
                 self._enter(Pressing(GripHistory(), command=state.command))
         elif self.fingers.advance_setpoints(self._settings.control.approach_speed):
             state.arrived_for += dt
-            if state.arrived_for > self._stuck_time:
+            if state.arrived_for > _STUCK_TIME:
                 off = self.fingers.distance_max
                 where = "at" if off < _ARRIVAL_DISTANCE else f"{math.degrees(off):.1f}° before"
                 self._warn("grasp", f"the fingers found no object and stopped {where} their limits")
@@ -471,12 +472,14 @@ class Control:
         is_reached = True
         if not isinstance(state, Pressing):
             self._end_turn_before_slip(history)
-            is_reached = not abs(pose.angle - grip.target_angle) >= ANGLE_TOLERANCE  # True for NaN
+            # The controller ignores angle errors within the noise of the estimate.
+            tolerance = max(ANGLE_TOLERANCE, GATE * grip.angle_std)
+            is_reached = not abs(pose.angle - grip.target_angle) > tolerance  # True for NaN
         if not isinstance(state, Turning):
             streamed = isinstance(state, Pressing) and state.command.is_streamed
             near = abs(self.fingers.force - grip.target) < _FRICTION_TOLERANCE * grip.target
             state.near_for = state.near_for + dt if near and not grip.is_dithering else 0.0
-            stuck = state.near_for > self._stuck_time
+            stuck = state.near_for > _STUCK_TIME
             is_reached = is_reached and (stuck or self._is_force_reached(streamed))
         state.reached_for = state.reached_for + dt if is_reached else 0.0
         if state.reached_for <= self._settling_time:
@@ -533,7 +536,7 @@ class Control:
         elif not history.increase_reported and grip.target > grip.commanded + margin:
             history.increase_reported = True
             why = "the object rotates" if grip.slip.has_turned else "sudden load"
-            if grip.slip.assumed_load > 0.0:
+            if not grip.slip.reflex_triggered:
                 why = (
                     f"the load may reach {grip.slip.assumed_load:.1f} N along the object's face "
                     "at each tip"

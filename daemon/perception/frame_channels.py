@@ -32,7 +32,6 @@ from softfinger.daemon.perception.hand_state import (
     GAIN,
     GATE,
     LATENCY,
-    MODEL_ERROR_TIME,
     MODULUS,
     OUTLIER_GATE,
     STATES,
@@ -64,6 +63,7 @@ D_MIN = 1e-5  # minimum displacement of a tip in contact [m]
 # shift of 0.06 radii changes the measured angle by 0.06 rad. Without a shift, the angle error of a
 # frame is at most 0.04 rad.
 IMAGE_SHIFT_MIN = 0.06
+_SLOPE_SMOOTHING = 0.9  # low-pass filter coefficient for ∂ ln F/∂d, applied on each frame
 _AMPLITUDE_ERROR = 0.02  # relative error of the pressure model
 
 
@@ -257,7 +257,7 @@ def update(
     tip.in_contact = True
     if tip.gain_is_unknown:
         expected = lookup(table, max(d_at_scan, D_MIN), tilt)
-        smoothing = 0.0 if is_new_contact else math.exp(-1.0 / (h.frame_rate * MODEL_ERROR_TIME))
+        smoothing = 0.0 if is_new_contact else _SLOPE_SMOOTHING
         tip.log_slope = interpolate(expected.force_d / expected.force, tip.log_slope, smoothing)
         innovation = math.log(shown.force / (scan.relaxation * expected.force))
         innovation -= h.mean[MODULUS + finger] + h.mean[GAIN + finger]

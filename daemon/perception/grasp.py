@@ -45,7 +45,7 @@ class GraspState(Record):
     load_curvature: float  # [m/N]
     pull_shear: float  # shear due to a pulling load, measured by solid tips [N]
     twist_shear: float  # shear due to a twisting load, measured by solid tips [N]
-    free_torque: Pair  # maximum torque of each joint during the approach, before contact [N·m]
+    free_torque: Pair  # maximum torque of each joint during this approach, before contact [N·m]
     unexplained_rotation: Pair  # accumulated object rotation not explained by joint motion [rad]
 
     # Consistency

@@ -226,9 +226,10 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
         grasp.jacobian_rotation[k] = motion.turn[k]
     _write_load(h, table1, table2, theta, motion)
     _write_shear(h)
-    if (left.has_new_frame or right.has_new_frame) and is_held(h) and not h.is_single:
+    has_new_frame = left.has_new_frame or right.has_new_frame
+    if has_new_frame and is_held(h) and not h.is_single and dt > 0.0:
         left.has_new_frame = right.has_new_frame = False
-        if grasp.load_arm > 0.0 and dt > 0.0:
+        if grasp.load_arm > 0.0:
             _update_by_torques(h, dt)
     _write_consistency(h)
     return GraspResult(result1, result2, angle, motion.width)

@@ -26,7 +26,7 @@ from softfinger.daemon.perception.grasp import (
     TORQUES,
 )
 from softfinger.daemon.perception.hand_state import HISTORY_TIME, LAW_POINTS, HandFilter, HistoryRow
-from softfinger.daemon.perception.prior import Prior
+from softfinger.daemon.perception.prior import RELAXATION_ERROR, Prior
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, VELOCITY_UNIT
 from softfinger.daemon.types import Contact, Frame, Goal, ObjectPose, Reading
@@ -39,7 +39,7 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 # Standard deviations of two settings
 _TAPER_ERROR = 0.1  # `object.taper` [rad]
 _LATENCY_ERROR = 0.03  # `tactile.latency` [s]
-GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
+_GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
 
 
 class HandEstimator:
@@ -84,7 +84,7 @@ class HandEstimator:
         state.gain_is_known = settings.estimator.free_gain is False
         state.t = -math.inf
         # Without `tip.relaxation`, the rubber may lose a part of the estimated force in a hold.
-        relaxation_error = 0.0 if any(settings.tip.relaxation) else states.MODEL_ERROR
+        relaxation_error = 0.0 if any(settings.tip.relaxation) else RELAXATION_ERROR
         ratios = np.linspace(1e-3, 1.0, LAW_POINTS)
         for finger, table in enumerate(tables):
             law = 0.0 if materials is None else materials[finger].force_error(ratios)
@@ -114,7 +114,7 @@ class HandEstimator:
             for at, (mean, error) in (
                 (states.MODULUS, (math.log(prior.modulus[0]), prior.modulus[1])),
                 (states.GAIN, (math.log(prior.gain[0]), prior.gain[1])),
-                (states.TORQUE, (prior.torque[0] - 1.0, prior.torque[1])),
+                (states.TORQUE, (prior.torque[0] - 1.0, prior.torque[0] * prior.torque[1])),
                 (states.ENCODER, (0.0, state.encoder_resolution / math.sqrt(12.0))),
             ):
                 state.prior_mean[at + finger], state.prior_variance[at + finger] = mean, error**2
@@ -133,8 +133,8 @@ class HandEstimator:
     def predict(self, reading: Reading, goal: Goal | None = None) -> None:
         """Predict the state at the time of a valid reading.
 
-        If a grip sets the servo currents, ``goal`` is the goal at the time of the reading.
-        Otherwise, ``goal`` is None.
+        From the start of an approach to the end of the grip, ``goal`` is the goal at the time of
+        the reading. Otherwise, ``goal`` is None.
         """
         q1, q2 = reading.q
         dq1, dq2 = reading.dq
@@ -176,7 +176,8 @@ class HandEstimator:
         if in_contact and tip.in_contact and not has_changed:
             contact.t_valid = frame.t_arrival
             return
-        # Report the contact as lost two frames before the limit `tactile.silent` turns torque off.
+        # The limit `tactile.silent` turns torque off after `frame_age_max`. Therefore, report the
+        # contact as lost two frames earlier.
         hidden_time = frame.t_arrival - contact.t_valid + 2.0 / self._state.frame_rate
         is_hidden = not in_contact and self._may_hide(finger, estimate.d_std)
         if is_hidden and hidden_time < self._state.frame_age_max:
@@ -327,4 +328,4 @@ def _tilt_moment_ratio(table: ContactTable, radius: float) -> float:
 
 def _commanded_current(goal: Goal, finger: int, q: float) -> float:
     """Return the goal current [A] if the joint is far from its goal, otherwise 0."""
-    return goal.current[finger] if goal.q[finger] - q > GOAL_DISTANCE else 0.0
+    return goal.current[finger] if goal.q[finger] - q > _GOAL_DISTANCE else 0.0

@@ -1,6 +1,6 @@
 """Define the hand's state, predict the state from joint motion, and update it with measurements.
 
-`docs/estimation.md` derives the model and lists the manoeuvres that make each state observable.
+`docs/estimation.md` describes the model and lists the manoeuvres that make each state observable.
 
 State           Unit   Meaning                                      Changes due to
 D               m      displacement of each tip                     joint motion, sideways shift
@@ -50,17 +50,20 @@ OUTLIER_GATE = 5.0  # minimum deviation that counts as a fault, in standard devi
 AGREEMENT = 0.25  # minimum share of a change that both tips or joints must show to confirm it
 MODEL_ERROR = 0.05  # relative error of the predicted motion and of the normal forces
 MODEL_ERROR_TIME = 0.1  # correlation time of the model error [s]
-TORQUE_NOISE = 0.05  # torque noise of a moving joint [N·m]; friction varies with position and time
+# Torque noise of a moving joint [N·m], and random walk of FRICTION [N·m/√s]. Friction varies with
+# position and time.
+TORQUE_NOISE = 0.05
 
-# Random walks during a grip (per √s)
-_WALK_SIDEWAYS = 3e-4  # random walk of (d1 − d2)/2 [m]; the object can move between the tips
+# Random walks [unit/√s]
+_WALK_SIDEWAYS = 3e-4  # (d1 − d2)/2 in a grip [m]; the object can move between the tips
 _WALK_SIDEWAYS_UNKNOWN_GAIN = 3e-5  # the same if frames measure only force × gain
-_WALK_LOOSE_D = 5e-3  # random walk of d for a contact without a grip [m]
-_WALK_LOOSE_ANGLE = 2e-2  # random walk of the angle for a contact without a grip [rad]
-_WALK_ANGLE = 2e-4  # random walk of the angle due to tip creep [rad]
+_WALK_LOOSE_D = 5e-3  # d of a contact without a grip [m]
+_WALK_LOOSE_ANGLE = 2e-2  # angle of a contact without a grip [rad]
+_WALK_ANGLE = 2e-4  # angle in a grip, due to tip creep [rad]
 _WALK_D_BIAS = 1e-4  # zero drift during sensor warm-up [m]
-_WALK_ANGLE_BIAS = 1e-3  # rad
+_WALK_ANGLE_BIAS = 1e-3  # shift of the pressure image [rad]
 _WALK_GAIN = 0.05  # gain drift during sensor warm-up
+
 _VELOCITY_TIME = 0.02  # correlation time of the velocity rounding error [s]
 _VARIANCE_MIN = 1e-6  # minimum ratio of measurement variance to predicted variance
 _CURRENT_ERROR = 0.25  # tolerated deviation of a current from its goal, as a fraction of the goal
@@ -123,8 +126,9 @@ class HandFilter(Record):
     velocity_unit: float  # [rad/s]
     latency: float  # `tactile.latency` [s]
     frame_rate: float  # `tactile.rate` [Hz]
-    frame_age_max: float  # `safety.frame_age_fault` as a time [s]
-    rejected_max: float  # maximum number of consecutive rejected frames
+    # `safety.frame_age_fault` as a time [s]; also the time after which a wrong current is a fault
+    frame_age_max: float
+    rejected_max: float  # number of consecutive rejected frames that counts as a fault
     contact_force: float  # `control.contact_force` [N]
     response: float  # `tactile.response` [s]
     relaxation: Annotated[FloatArray, 3]  # `tip.relaxation`
@@ -133,7 +137,7 @@ class HandFilter(Record):
     inertia: float  # joint inertia [kg·m²]
     load_held: float  # fraction of the tip moment that gear friction can balance
     is_single: bool  # True for a one-finger hand
-    is_gripping: bool  # True if a grip controls the joint torques
+    is_gripping: bool  # True from the start of an approach to the end of the grip
     gain_is_known: bool  # True if `estimator.free_gain` is false
     t: float  # time of the last reading [s]
     newest_row: int  # index of the newest row in the history
@@ -253,15 +257,15 @@ def _walk_d(h: HandFilter, common: float, opposite: float, dt: float) -> None:
 def shift_sideways(h: HandFilter, variance: float) -> None:
     """Add process noise for a sideways shift of the object between the tips.
 
-    ``variance`` is the variance of the shift [m²]. A shift x towards the left tip changes d1 by x
-    and d2 by −x. Only a push can shift an object that a grip holds. The push equals the change in
-    F2 − F1, which is −x times the sum of the tip stiffnesses.
+    ``variance`` is the variance of the shift [m²]. A shift x towards the right finger changes d1 by
+    −x and d2 by x. Only a push can shift an object that a grip holds. The push equals the change in
+    F2 − F1, which is x times the sum of the tip stiffnesses.
     """
     h.scratch[:] = 0.0
-    h.scratch[D] = 1.0
-    h.scratch[D + 1] = -1.0
+    h.scratch[D] = -1.0
+    h.scratch[D + 1] = 1.0
     if is_held(h):
-        h.scratch[PUSH] = -(h.grasp.stiffness[0] + h.grasp.stiffness[1])
+        h.scratch[PUSH] = h.grasp.stiffness[0] + h.grasp.stiffness[1]
     for i in (D, D + 1, PUSH):
         for j in (D, D + 1, PUSH):
             h.covariance[i, j] += variance * h.scratch[i] * h.scratch[j]
@@ -281,9 +285,13 @@ def predict(
     """Predict the state at time ``t`` from a joint reading [rad, rad/s, A].
 
     ``goal`` is the current that a grip commands for each joint [A]. If a goal is 0, the measured
-    current is used. ``is_gripping`` is True while a grip sets the joint torques.
+    current is used. ``is_gripping`` is True from the start of an approach to the end of the grip.
     """
     h = hands[0]
+    if is_gripping and not h.is_gripping:  # An approach begins.
+        for k in range(2):
+            _restart_free_torque(h, k, t)
+            h.grasp.free_torque[k] = 0.0
     h.is_gripping = is_gripping
     if not is_gripping:
         h.grasp.rejects_frames[:] = 0.0
@@ -304,6 +312,7 @@ def predict(
         dt = 0.0
         for k in range(2):
             h.tip[k].q = h.tip[k].encoder = q[k]
+            reset(h, ENCODER + k, 0.0, h.prior_variance[ENCODER + k])
     h.last_closing_speed = h.closing_speed
     h.closing_speed += (0.5 * (dq[0] + dq[1]) - h.closing_speed) * min(dt / _VELOCITY_TIME, 1.0)
     _move(h, (dq[0] * dt, dq[1] * dt), dt)
@@ -374,8 +383,9 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
     """Advance the joints by ``step`` [rad] in ``dt`` seconds, and move the tips and the object.
 
-    The object rotates by turn1 Δq1 − turn2 Δq2. Each displacement changes by half the change in d1
-    + d2 (docs/estimation.md).
+    If both tips are in contact, the object rotates by turn1 Δq1 − turn2 Δq2, and each displacement
+    changes by half the change in d1 + d2 (docs/estimation.md). Otherwise, the object does not move,
+    and each joint moves only its own tip.
     """
     left = h.tip[0]
     right = h.tip[1]
@@ -383,17 +393,17 @@ def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
     arm1, arm2 = motion.arm
     turn1, turn2 = motion.turn
     # Before contact, the gap shrinks at the rate at which d grows during contact.
-    if h.is_single:
-        by1, by2 = arm1, arm2
-    else:
+    both = left.in_contact and right.in_contact
+    by1, by2 = arm1, arm2
+    if both:
         by1 = 0.5 * (arm1 + motion.slide * turn1)
         by2 = 0.5 * (arm2 - motion.slide * turn2)
-    if not (left.in_contact and right.in_contact):
+    else:
         turn1 = turn2 = 0.0
     step1, step2 = step
     d_step1 = by1 * step1
     d_step2 = by2 * step2
-    if not h.is_single:
+    if both:
         d_step1 = d_step2 = d_step1 + d_step2
     rotation = turn1 * step1 - turn2 * step2
     left.q += step1
@@ -412,33 +422,36 @@ def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
         h.mean[D + 1] += d_step2
     h.mean[ANGLE] += rotation
     if dt > 0.0:
-        rotation_error = MODEL_ERROR * rotation
-        # In a rotation, the fingers move in opposite directions, so their errors do not cancel.
-        apart = motion.across + 2.0 * h.radius - h.mean[D] - h.mean[D + 1]
-        closing_error = MODEL_ERROR * math.hypot(d_step1, 0.5 * apart * rotation)
-        sideways_error = MODEL_ERROR * (arm1 * step1 - arm2 * step2)
-        if h.is_single:  # The missing finger does not move.
-            closing_error = MODEL_ERROR * (d_step1 + d_step2)
-            sideways_error = 0.0
-        samples = MODEL_ERROR_TIME / dt
-        h.covariance[ANGLE, ANGLE] += rotation_error * rotation_error * samples
-        _walk_d(h, closing_error, sideways_error, samples)
-    _add_rounding_noise(h, 0, by1, turn1, dt)
-    _add_rounding_noise(h, 1, by2, -turn2, dt)
+        # All motion within MODEL_ERROR_TIME has the same error.
+        relative = MODEL_ERROR * math.sqrt(max(MODEL_ERROR_TIME / dt, 1.0))
+        if both:
+            # In a rotation, the fingers move in opposite directions, so their errors do not cancel.
+            apart = motion.across + 2.0 * h.radius - h.mean[D] - h.mean[D + 1]
+            closing_error = relative * math.hypot(d_step1, 0.5 * apart * rotation)
+            _walk_d(h, closing_error, relative * (arm1 * step1 - arm2 * step2), 1.0)
+            _walk(h, ANGLE, relative * rotation, 1.0)
+        else:
+            _walk(h, D, relative * d_step1, 1.0)
+            _walk(h, D + 1, relative * d_step2, 1.0)
+    _add_rounding_noise(h, 0, by1, turn1, both, dt)
+    _add_rounding_noise(h, 1, by2, -turn2, both, dt)
 
 
 @inner_kernel
-def _add_rounding_noise(h: HandFilter, finger: int, by: float, turn: float, dt: float) -> None:
+def _add_rounding_noise(
+    h: HandFilter, finger: int, by: float, turn: float, both: bool, dt: float
+) -> None:
     """Add process noise for the rounding of a joint's velocity.
 
-    A joint angle error of 1 rad changes d by ``by`` [m] and φ by ``turn`` [rad].
+    A joint angle error of 1 rad changes d by ``by`` [m] and φ by ``turn`` [rad]. If ``both`` tips
+    are in contact, the error changes both displacements.
     """
     variance = h.velocity_unit * h.velocity_unit / 12.0 * _VELOCITY_TIME * dt
     h.scratch[:] = 0.0
     h.scratch[ENCODER + finger] = 1.0
     h.scratch[ANGLE] = turn
     for i in range(2):
-        if i == finger or not h.is_single:
+        if i == finger or both:
             h.scratch[D + i] = by
     for i in (D, D + 1, ENCODER + finger, ANGLE):
         for j in (D, D + 1, ENCODER + finger, ANGLE):
@@ -539,8 +552,9 @@ def _measure_free_torque(
     """Measure the friction of a joint as the maximum torque during free motion.
 
     Readings from the last `frame_age_max` seconds are excluded, because the frames may not yet show
-    a contact that has already begun. A measurement from the previous approach is discarded once the
-    tip has been free for `frame_age_max` seconds, because a light contact may be lost for a moment.
+    a contact that has already begun. The start of an approach discards earlier measurements.
+    Without a new approach, an earlier measurement is discarded once the tip has been free for
+    `frame_age_max` seconds, because a light contact may be lost for a moment.
     """
     tip = h.tip[finger]
     accelerating = h.inertia * speed_change / dt
@@ -554,6 +568,15 @@ def _measure_free_torque(
         tip.free_torque_max[1] = tip.free_torque_max[0]
         tip.free_torque_max[0] = 0.0
         tip.window_start = t
+
+
+@inner_kernel
+def _restart_free_torque(h: HandFilter, finger: int, t: float) -> None:
+    """Discard the unfinished friction measurement of a joint."""
+    tip = h.tip[finger]
+    tip.free_torque = 0.0
+    tip.free_torque_max[:] = 0.0
+    tip.window_start = t
 
 
 @inner_kernel

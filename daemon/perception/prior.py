@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 MODULUS_ERROR = 0.2  # relative modulus error of an uncalibrated tip
 CALIBRATED_ERROR = 0.05  # relative modulus error after `softfinger calibrate modulus`
+# Typical relative force loss in a hold if `tip.relaxation` is not set. Silicone rubber loses a few
+# percent to 15 % within a minute.
+RELAXATION_ERROR = 0.07
 
 
 class Prior(NamedTuple):

@@ -3,8 +3,8 @@
 An unloaded cell reads its zero offset plus noise. With a tip radius of 20 mm, about 60 % of a 58 mm
 wide grid lies outside the tip. The outer cells show the zero offset and the noise even while the
 tip is in contact. A second contact that loads only a few outer cells does not change the median
-reading. Readings are clipped at 0, so unloaded cells cannot show a negative zero offset.
-`perception.frame_channels` detects a negative offset from the joint motion while the fingers close.
+reading. Readings are clipped at 0, so unloaded cells cannot show a negative zero offset. If the
+offset falls during a grip, the hand filter estimates the offset as `D_BIAS`.
 """
 
 from __future__ import annotations

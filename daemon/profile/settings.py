@@ -445,7 +445,7 @@ class ControlSettings(Section):
     dither_frequency: float = setting(
         5.0, "Hz", "Dither frequency; lower frequencies would make the grip swing.", ge=3, le=50
     )
-    dither_time: Delay = setting(2.0, "s", "Time constant of the dither decay.")
+    dither_time: Delay = setting(2.0, "s", "Duration of the dither, whose amplitude falls to 0.")
     joint_inertia: Factor = setting(
         0.010, "kg·m²", "Inertia of the finger and the rotor, used to compute the damping."
     )

@@ -3,7 +3,7 @@
 Any baud rate is allowed. A USB board may ignore the baud rate, but ``tactile.baud`` must then be
 the actual transfer rate (10 bits per byte), because the reader subtracts the transfer time of each
 frame from its arrival time. The board clock needs a quartz: if it is more than 200 ppm slower than
-the computer's clock, the frame times become increasingly late.
+the computer's clock, the frame times become increasingly too early.
 
 The firmware sends each scan without a request, in four steps:
 

@@ -9,8 +9,11 @@ In an unchanged copy, all tests must pass.
 """
 
 import argparse
+import ast
+import contextlib
+import math
+import numbers
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -22,28 +25,37 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("daemon/perception", "daemon/control")
 _COPIED = ("config", "daemon", "kinematics", "softfinger", "tests", "tools", "pyproject.toml")
-_CONSTANT = re.compile(
-    r"^(_?[A-Z][A-Z_]+) = ([0-9][^#\n,]*?|math\.radians\(.*?\))(?=\s*(?:#|$))", re.MULTILINE
-)
 
 _LISTED = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 NOT_TUNED: dict[str, str] = _LISTED.pop("not_tuned")
-# Test of each constant, as file::function
-TESTS = {
-    name: f"{file}::{test}"
+_PAIRS = [
+    (name, f"{file}::{test}")
     for file, tests in _LISTED.items()
     for test, names in tests.items()
     for name in names
-}
+]
+TESTS = dict(_PAIRS)  # test of each constant, as file::function
+assert len(TESTS) == len(_PAIRS), "constants.toml lists a constant twice"
 
 
-def constants() -> dict[str, tuple[Path, str]]:
-    """Return the file and the value of each numeric constant; the keys are ``module.NAME``."""
+def constants() -> dict[str, tuple[Path, str, str]]:
+    """Return the numeric constants of the modules; the keys are ``module.NAME``.
+
+    Each value contains the file, the source text of the assignment, and that of the number.
+    """
     found = {}
-    for folder in FOLDERS:
-        for file in sorted((ROOT / folder).glob("*.py")):
-            for name, value in _CONSTANT.findall(file.read_text()):
-                found[f"{file.stem}.{name}"] = file.relative_to(ROOT), value
+    for file in (file for folder in FOLDERS for file in sorted((ROOT / folder).glob("*.py"))):
+        text = file.read_text()
+        for node in ast.parse(text).body:
+            if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+                continue
+            name = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            line, value = (ast.get_source_segment(text, each) or "" for each in (node, node.value))
+            with contextlib.suppress(NameError):  # not a plain number
+                if isinstance(name, ast.Name) and isinstance(
+                    eval(value, {"math": math}), numbers.Real
+                ):
+                    found[f"{file.stem}.{name.id}"] = file.relative_to(ROOT), line, value
     return found
 
 
@@ -63,12 +75,13 @@ def passes(tests: Iterable[str], name: str = "", factor: float = 1.0) -> bool:
             else:
                 shutil.copy(source, target)
         if name:
-            file, value = constants()[name]
-            line = f"\n{name.partition('.')[2]} = "
+            file, line, value = constants()[name]
             text = (copy / file).read_text()
-            (copy / file).write_text(text.replace(line + value, line + scaled(value, factor), 1))
+            assert f"\n{line}" in text
+            changed = line.removesuffix(value) + scaled(value, factor)
+            (copy / file).write_text(text.replace(f"\n{line}", f"\n{changed}", 1))
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider"]
-        command += [f"tests/unit/{each}" for each in tests]
+        command += ["--timeout=120", *(f"tests/unit/{each}" for each in tests)]
         environment = os.environ | {"PYTHONPATH": folder, "XDG_CACHE_HOME": f"{folder}/cache"}
         run = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
     if run.returncode not in (0, 1):
@@ -81,6 +94,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", help="names such as hand_state.GATE; default: all")
     names = parser.parse_args().names or list(TESTS)
+    if unknown := [name for name in names if name not in TESTS]:
+        parser.error(f"{unknown[0]}: not a constant with a test in constants.toml")
     if not passes(dict.fromkeys(TESTS[name] for name in names)):
         print("the tests fail with the present constants")
         return 1

@@ -63,25 +63,28 @@ class Held:
         seconds: float,
         d: Sequence[float] = (D, D),
         turned: Sequence[float] = (0.0, 0.0),
-        dq: float = 0.0,
+        dq: float | Sequence[float] = 0.0,
         current: Sequence[float] = (0.0, 0.0),
         goal: float = 0.0,
         touches: bool = True,
+        gripping: bool | None = None,
         fingers: Sequence[int] = (0, 1),
     ) -> None:
         """Send readings every 2 ms and frames of ``fingers`` every 10 ms.
 
-        ``d`` [m] and the object angles ``turned`` [rad] are those that each frame shows. If
-        ``touches`` is False, no grip sets the torques.
+        ``d`` [m] and the object angles ``turned`` [rad] are those that each frame shows.
+        ``gripping`` is True from the start of an approach; by default, while the tips touch.
         """
+        gripping = touches if gripping is None else gripping
+        speeds = [dq, dq] if isinstance(dq, float) else list(dq)
         for _ in range(round(seconds / DT)):
             self.t, self.tick = self.t + DT, self.tick + 1
-            self.q = [q + dq * DT for q in self.q]
+            self.q = [q + speed * DT for q, speed in zip(self.q, speeds, strict=True)]
             reading = Reading(
-                t=self.t, q=list(self.q), dq=[dq, dq], current=list(current), valid=True
+                t=self.t, q=list(self.q), dq=speeds, current=list(current), valid=True
             )
             goals = Goal(q=[q + 0.35 for q in self.q], current=[goal, goal])
-            self.estimator.predict(reading, goals if touches else None)
+            self.estimator.predict(reading, goals if gripping else None)
             if self.tick % 5 == 0:
                 self.frames(d, turned, touches, fingers)
             self.estimator.write_contacts(self.t, self.contacts, self.pose)
@@ -192,6 +195,23 @@ def test_torques_are_measured_only_in_the_first_closing_motion(pause, measures):
     before = held.pose.nis_torque
     held.run(0.1, dq=0.1, current=current)
     assert (held.pose.nis_torque != before) == measures
+
+
+def test_torque_before_the_approach_does_not_count_as_friction():
+    """A blocked joint needs much torque, which must not remain after the obstacle is removed."""
+    held = Held()
+    for gripping, torque in ((False, 0.3), (True, 0.06)):
+        amps = torque / TORQUE_CONSTANT * SETTINGS.control.driving
+        held.run(0.5, current=(amps, amps), touches=False, gripping=gripping)
+        assert held.grasp.free_torque == pytest.approx([torque, torque], rel=0.01)
+
+
+def test_a_closing_finger_does_not_move_an_object_that_only_the_other_finger_touches():
+    held = Held()
+    held.run(0.2, fingers=(0,))
+    held.run(0.3, fingers=(0,), dq=(0.0, 0.3))
+    assert held.contacts[0].d == pytest.approx(D, abs=2e-5)
+    assert held.pose.angle == 0.0
 
 
 def test_short_torque_peaks_do_not_count_as_friction():

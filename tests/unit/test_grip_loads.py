@@ -331,20 +331,20 @@ def test_a_force_increase_is_held_for_one_second_and_removed_within_two():
 
 
 @pytest.mark.parametrize("kind", ["pull_shear", "twist_shear"])
-@pytest.mark.parametrize(("jump", "raised"), [(0.3, False), (0.7, True)])
-def test_a_shear_jump_counts_only_beyond_five_standard_deviations(kind, jump, raised):
-    watched, rng = at_rest(), np.random.default_rng(1)
-    for shear in [*np.linspace(0.0, 3.3, 400), *np.full(200, 3.3)]:
-        setattr(watched.held, kind, shear + 0.1 * rng.standard_normal())
-        watched.run(0.0, 5)  # A frame arrives every five ticks.
-        assert not watched.grip.slip.reflex_triggered
+@pytest.mark.parametrize(("jump", "raised"), [(0.4, False), (0.8, True)])
+def test_a_shear_jump_counts_only_beyond_the_noise(kind, jump, raised):
+    watched = at_rest()
+    for shear in np.linspace(0.0, 3.3, 2000):
+        setattr(watched.held, kind, shear)
+        watched.run(0.0, 1)
+    watched.run(0.0, 500)
     setattr(watched.held, kind, 3.3 + jump)
     watched.run(0.0, 1)
     assert watched.grip.slip.reflex_triggered == raised
 
 
-@pytest.mark.parametrize(("share", "is_load"), [(0.1, False), (0.2, True)])
-def test_rubber_may_lose_15_percent_of_the_force_without_a_load(share, is_load):
+@pytest.mark.parametrize(("share", "is_load"), [(0.14, False), (0.3, True)])
+def test_rubber_may_lose_a_fifth_of_the_force_without_a_load(share, is_load):
     watched = at_rest()
     lost = share * 10.0 * 0.079 + 0.05  # lost moment plus joint friction [N·m]
     for load in np.linspace(0.0, -lost / 0.03, 4000):
@@ -360,7 +360,7 @@ def test_friction_that_rolling_uses_up_counts_as_at_most_70_percent():
     assert watched.run(0.0, 500) == pytest.approx(0.5 * 2.0 / (0.3 * 0.6), rel=0.05)
 
 
-def test_the_tip_forces_are_equalised_within_80_ms_and_half_a_degree():
+def test_the_tip_forces_are_equalised_within_80_ms_and_a_quarter_degree():
     def turned(imbalance: float, ticks: int) -> tuple[float, float]:
         """Return the remaining imbalance [N] and the rotation of the object [rad]."""
         watched = at_rest()
@@ -374,4 +374,4 @@ def test_the_tip_forces_are_equalised_within_80_ms_and_half_a_degree():
         return off, 1.5 * (state.offset - start)
 
     assert turned(0.4, 40)[0] / 0.4 == pytest.approx(1.0 / math.e, abs=0.1)
-    assert math.radians(0.3) < abs(turned(20.0, 1000)[1]) < math.radians(0.6)
+    assert math.radians(0.15) < abs(turned(20.0, 1000)[1]) < math.radians(0.4)

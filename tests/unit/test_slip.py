@@ -90,6 +90,15 @@ def test_turning_alone_does_not_increase_the_force(force, sections):
             assert seen.force.mean(axis=1).max() < (1.1 + 2.0 * KNOWN) * force
 
 
+def test_a_sudden_load_is_named_even_if_a_load_is_declared():
+    with Hand({"control": {"object_load": 2.0}}) as hand:
+        grasped(hand)
+        hand.plant.apply_load(0.0, 13.0)
+        hand.watch(0.2)
+        (told,) = [text for _, kind, text in hand.events if kind == "slip"]
+        assert told.endswith("N: sudden load")
+
+
 def test_an_object_that_twists_in_the_grip_is_gripped_with_more_force():
     for raised, held in ((0.0, False), (10.0, True)):
         with Hand({"control": {"grip_raise_max": raised}}) as hand:

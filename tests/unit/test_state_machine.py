@@ -23,7 +23,6 @@ class Machine:
         grasp.moment_arm, grasp.energy_arm = [0.079, 0.079], [0.079, 0.079]
         grasp.jacobian_rotation, grasp.stiffness = [0.75, 0.75], [6e3, 6e3]
         grasp.d, grasp.normal = [4e-3, 4e-3], [FORCE, FORCE]
-        grasp.angle_std = 7e-4
         self.grasp = grasp
         self.control = Control(Settings(), self.state, grasp)
         self.control.arm()
@@ -86,6 +85,17 @@ def test_a_turn_ends_within_half_a_degree_of_its_target(off, arrives):
     machine.touch(angle=0.1 - math.radians(off))
     machine.run(3.0)
     assert isinstance(machine.control.state, Settled if arrives else Turning)
+
+
+def test_a_turn_ends_within_the_noise_of_the_angle():
+    """The controller does not correct errors within the noise, so such errors would persist."""
+    machine = Machine()
+    assert machine.hold() == "holding"
+    machine.grasp.angle_std = 0.01
+    machine.control.rotate(0.1)
+    machine.touch(angle=0.1 - math.radians(1.0))
+    machine.run(3.0)
+    assert isinstance(machine.control.state, Settled)
 
 
 @pytest.mark.parametrize(("change", "expected"), [(1.3e-3, Settled), (3e-3, Changing)])

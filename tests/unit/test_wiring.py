@@ -90,7 +90,7 @@ def greatest_force(daemon: Daemon, seconds: float) -> float:
     return greatest
 
 
-OFF = [0.004, -0.006]  # offset of the object from the middle [m]
+OFF = [0.006, -0.006]  # offset of the object from the middle [m]
 HEAVY = {"object_mass": 0.5, "table_friction": 0.5}
 
 
