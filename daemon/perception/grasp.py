@@ -29,7 +29,6 @@ class GraspState(Record):
     normal: Pair  # normal forces [N]
     shear: float  # ratio of shear force to normal force, at equilibrium without a load
     angle_std: float  # standard deviation of the object angle [rad]
-    taper: float  # angle α between the object faces [rad]
     tilt_moment_ratio: float  # (∂U/∂θ)/(F θ d), a constant for an upright tip
 
     # Moment arms

@@ -219,7 +219,6 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     dt = h.t - grasp.t
     grasp.t = h.t
     grasp.angle_std = math.sqrt(max(h.covariance[ANGLE, ANGLE], 0.0))
-    grasp.taper = taper
     grasp.jacobian_slide = motion.slide
     for k in range(2):
         grasp.moment_arm[k] = motion.arm[k]

@@ -40,6 +40,7 @@ from softfinger.kinematics.hand.grasp_state import total_tilt
 _TAPER_ERROR = 0.1  # `object.taper` [rad]
 _LATENCY_ERROR = 0.03  # `tactile.latency` [s]
 _GOAL_DISTANCE = 0.25  # position error at which a joint draws the full goal current [rad]
+_DEPTHS = np.linspace(0.0, 1.0, LAW_POINTS)  # values of d/radius in `TrackedTip.law_error`
 
 
 class HandEstimator:
@@ -85,9 +86,12 @@ class HandEstimator:
         state.t = -math.inf
         # Without `tip.relaxation`, the rubber may lose a part of the estimated force in a hold.
         relaxation_error = 0.0 if any(settings.tip.relaxation) else RELAXATION_ERROR
-        ratios = np.linspace(1e-3, 1.0, LAW_POINTS)
         for finger, table in enumerate(tables):
-            law = 0.0 if materials is None else materials[finger].force_error(ratios)
+            law = (
+                0.0
+                if materials is None
+                else materials[finger].force_error(np.maximum(_DEPTHS, 1e-3))
+            )
             known = math.hypot(table.max_error, relaxation_error)
             state.tip[finger].law_error[:] = np.hypot(law, known)
             state.tip[finger].relaxation = 1.0 + sum(settings.tip.relaxation)
@@ -311,9 +315,7 @@ class HandEstimator:
         by_tilt = found.force_theta
         slopes = modulus * np.array([found.force_d, by_tilt * along, by_tilt * across])
         fraction = contact.d / self._state.radius
-        law_error = np.interp(
-            fraction, np.linspace(0.0, 1.0, LAW_POINTS), self._state.tip[finger].law_error
-        )
+        law_error = np.interp(fraction, _DEPTHS, self._state.tip[finger].law_error)
         relative = law_error**2 + factor_variance
         variance = slopes @ estimate.covariance[:3, :3] @ slopes + relative * contact.force**2
         contact.force_std = math.sqrt(variance)

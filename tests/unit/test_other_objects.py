@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.control.state_machine import Gripping
+from softfinger.daemon.perception.hand_state import TAPER
 from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.reference_hand import ReferenceHand
 
@@ -73,7 +74,7 @@ def test_a_wedge_is_measured_and_turned_correctly(taper, told, frames):
             held = rig.estimator.grasp
             used = np.abs(rig.plant.tangential / rig.plant.normal).max()
             assert held.shear == pytest.approx(used, abs=0.03)
-            assert held.taper == pytest.approx(taper, abs=0.005)
+            assert rig.estimator._state.mean[TAPER] == pytest.approx(taper, abs=0.005)
         assert rig.warnings() == []
 
 
