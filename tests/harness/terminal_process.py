@@ -82,13 +82,6 @@ class TerminalProcess:
     def type(self, keys: bytes) -> None:
         os.write(self.master, keys)
 
-    def press(self, key: bytes, text: str) -> None:
-        """Press a key repeatedly until ``text`` appears; a busy machine may lose a key press."""
-        while text not in self.text():
-            self.type(key)
-            later = time.monotonic() + 1.0
-            self.wait(lambda later=later: text in self.text() or time.monotonic() > later)
-
     def ended(self) -> int:
         """Wait for the process to exit; return its exit status."""
         self.wait(lambda: self.process.poll() is not None)
