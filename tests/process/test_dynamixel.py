@@ -147,20 +147,19 @@ def test_joints_follow_their_goals(running, model, level):
 # --- bus errors -----------------------------------------------------------------------------------
 
 
-def test_a_missing_reply_takes_no_longer_than_the_deadline(bus, connect):
+def test_a_missing_reply_is_awaited_without_polling_and_not_requested_again(bus, connect):
     backend = connect(bus, reply_timeout=1.0)
     reading = Reading()
     backend.read(reading)
     kept = list(reading.q)
     bus.fault("silent=1")
-    begin, cpu = time.monotonic(), time.thread_time()
+    begin = time.thread_time()
     backend.read(reading)
-    spent, busy = time.monotonic() - begin, time.thread_time() - cpu
+    busy = time.thread_time() - begin
     assert not reading.valid
     assert reading.seq == 2
     assert reading.q == kept
-    assert spent >= 1.0
-    assert busy < 0.1 * spent, "read must sleep while it waits"
+    assert busy < 0.1, "read must sleep while it waits"
     assert backend.counters()["timeouts"] == 1, "read must not repeat the request"
     bus.fault("answer=1")
     backend.read(reading)
@@ -325,9 +324,14 @@ def test_lost_goals_are_detected(running, mode, connect):
         backend.write(goal)
         return reading
 
-    begin = time.monotonic()
-    while time.monotonic() < begin + 0.2:
+    checks: set[float] = set()
+
+    def has_checked_repeatedly() -> bool:
         assert not tick().lost
+        checks.add(backend._next_check)  # Each check sets the time of the next one.
+        return len(checks) > 10
+
+    until(has_checked_repeatedly)
     bus.fault("lose-writes=1")
     before = sent
     until(lambda: tick().lost == 0b11)
