@@ -13,6 +13,7 @@ import pytest
 import zmq
 
 from softfinger import Hand
+from softfinger.daemon.client import command_client
 from tests.conftest import until
 from tests.harness.daemon_process import ask, softfinger, started
 
@@ -154,9 +155,6 @@ def test_a_command_received_during_a_stall_is_refused(daemon, context):
     (arm,) = stalled(daemon, context, {"command": "arm"})
     assert (arm["ok"], arm["reason"]) == (False, "late")
     assert ask(daemon.commands, "status")["torque"] is False
-    (disarm,) = stalled(daemon, context, {"command": "disarm"})
-    # The command may arrive late on a busy machine.
-    assert disarm["ok"] or disarm["reason"] == "late"
 
 
 def test_a_stop_received_during_a_stall_also_cancels_waiting_commands(daemon, context):
@@ -170,12 +168,14 @@ def test_a_stop_received_during_a_stall_also_cancels_waiting_commands(daemon, co
     ]
 
 
-def test_a_client_waiting_for_its_reply_is_served_after_a_stall(daemon):
+def test_a_client_waiting_for_its_reply_is_served_after_a_stall(daemon, caplog, monkeypatch):
+    monkeypatch.setattr(command_client, "SILENCE_TIME", 0.5)
     with Hand(*daemon.addresses, timeout=60.0) as hand, ThreadPoolExecutor() as pool:
         hand.status()
         daemon.running.process.send_signal(signal.SIGSTOP)
         arming = pool.submit(hand.arm)
-        select.select([], [], [], 0.5)  # Stall for half a second.
+        # This warning means that the command was sent at least half a second ago.
+        until(lambda: "no reply to arm" in caplog.text)
         daemon.running.process.send_signal(signal.SIGCONT)
         arming.result(60.0)
         assert hand.status()["torque"] is True
