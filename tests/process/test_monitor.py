@@ -282,6 +282,7 @@ def test_plain_lines_through_a_pipe(fake):
         lines: list[str] = []
         while sum(" holding " in line for line in lines) < 2:
             lines.append(plain.stdout.readline())
+            assert lines[-1], plain.stderr.read()
             if " holding " in lines[-1]:
                 fake.send_event("mode", "grasping → holding", "warning")
         text = "".join(lines)

@@ -81,7 +81,7 @@ def test_time_page_shows_every_value_and_its_goal(run):
     figure = drawn(run, "time")
     force, angle, d, theta = figure.axes
     for panel, field, factor in ((force, "force", 1.0), (d, "d", 1e3), (theta, "theta", 57.29578)):
-        for line, name in zip(panel.lines, ("left", "right"), strict=False):
+        for line, name in zip(panel.lines[:2], ("left", "right"), strict=True):
             assert line.get_label() == name
             assert np.asarray(line.get_ydata()) == pytest.approx(
                 factor * run.states[f"{name}.{field}"], nan_ok=True

@@ -1,6 +1,7 @@
 """Test the parts of the controller, and the controller's performance on the simulated plant."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,14 @@ def grasped(hand: SimulatedDaemon, force: float = 10.0, seconds: float = 2.0) ->
     seen = hand.watch(seconds)
     start = int(np.flatnonzero((seen.force > 0.3).all(axis=1))[0])
     return TrueStates(seen.t[start:], seen.force[start:], seen.angle[start:], seen.slip[start:])
+
+
+def run_until(hand: SimulatedDaemon, condition: Callable[[], object]) -> None:
+    """Run until ``condition`` is true; fail if this takes longer than 5 s of virtual time."""
+    finish = hand.now + 5.0
+    while not condition():
+        assert hand.now < finish, f"mode {hand.mode}"
+        hand.run(0.01)
 
 
 def last_time(seen: TrueStates, off: NDArray[np.bool_]) -> float:
@@ -132,8 +141,7 @@ def test_a_slow_increase_of_the_force_is_no_fault(slow):
 def test_removing_the_object_ends_the_grip(last):
     with watched({}) as hand:
         hand.grasp(6.0)
-        while hand.contacts[0].force < 3.0:
-            hand.run(0.01)
+        run_until(hand, lambda: hand.contacts[0].force >= 3.0)
         if last != "grasp":
             hand.run(2.5)
             assert hand.mode == "holding"
@@ -219,8 +227,7 @@ def test_joints_that_stop_before_their_goal_do_not_keep_pressing():
         hand.command("move", left=0.3, right=0.3)  # The object stops both fingers.
         hand.run(1.0)
         pressed = hand.plant.force.mean()
-        while hand.mode == "moving":
-            hand.run(0.01)
+        run_until(hand, lambda: hand.mode != "moving")
         hand.run(1.0)
         assert hand.mode == "armed"
         assert [kind for level, kind, _ in hand.events if level != "info"] == ["short"]
@@ -519,8 +526,7 @@ def test_a_force_slightly_off_due_to_friction_counts_as_reached_after_2_s(
     with SimulatedDaemon({}) as hand:
         hand.grasp(6.0)
         monkeypatch.setattr(type(hand.control.fingers), "force", property(lambda _: share * 6.0))
-        while not hand.plant.normal.min() > 4.0:
-            hand.run(0.01)
+        run_until(hand, lambda: hand.plant.normal.min() > 4.0)
         hand.run(1.5)
         assert hand.mode == "grasping"
         hand.run(1.5)

@@ -22,7 +22,7 @@ def path() -> tuple[Sheet, ...]:
 
 
 def test_compression_reaches_8_mm_at_every_angle(compression):
-    for tilt, run in zip(TILTS, compression, strict=False):
+    for tilt, run in zip(TILTS, compression[:-1], strict=True):
         assert run["d"][0] == 0.0
         assert run["d"].max() == pytest.approx(8.0, abs=0.1)
         touching = run["d"] > 0.0
