@@ -74,6 +74,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     made.close()
 
 
+@pytest.mark.waits
 def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     loop = rig.loop
     rig.does("arm")
@@ -100,6 +101,7 @@ def test_an_unplugged_bus_is_reopened_on_command_with_torque_off(rig):
     rig.until(lambda: rig.torque() == [1, 1])
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize(
     ("fault", "responds", "mended", "refusal"),
     [("silent=2", 0, "answer=2", "no reply"), ("overload=1", 1, "reboot=1", "hardware error")],
