@@ -124,7 +124,7 @@ class AsyncHand(HandClient[Coroutine[Any, Any, None]]):
 
         Raises the same exceptions as `Hand.wait_for`.
         """
-        wait = Wait(condition, timeout)
+        wait = Wait(condition, timeout, self._now)
         async with self.stream() as states:
             while True:
                 try:

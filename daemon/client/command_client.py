@@ -183,6 +183,7 @@ class HandClient(Generic[_Done]):
     """
 
     _CONTEXT: type[zmq.Context[Any]] = zmq.Context
+    _now = staticmethod(time.monotonic)  # clock used by `wait_for` [s]
 
     def __init__(
         self,

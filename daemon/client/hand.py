@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any, Self, TypeVar
@@ -83,7 +82,6 @@ class Hand(HandClient[None]):
     """
 
     _states: Subscription[HandState] | None = None
-    _now = staticmethod(time.monotonic)  # clock used by `wait_for` [s]
 
     def __enter__(self) -> Self:
         return self

@@ -223,10 +223,7 @@ class Wait:
     """Wait up to ``timeout`` [s] for a state that satisfies ``condition``."""
 
     def __init__(
-        self,
-        condition: Callable[[HandState], object],
-        timeout: float,
-        now: Callable[[], float] = time.monotonic,
+        self, condition: Callable[[HandState], object], timeout: float, now: Callable[[], float]
     ) -> None:
         self._condition = condition
         self._timeout = timeout

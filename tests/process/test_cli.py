@@ -80,8 +80,8 @@ def test_send_without_a_daemon_or_with_an_invalid_command(addresses, inline):
     assert done.returncode == 2
     assert f"send: no reply to arm from {addresses[1]} within 0.1 s" in done.stderr
     assert "is softfinger running, or still starting?" in done.stderr
-    done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "3")
-    assert f"no reply to arm from {addresses[1]} yet; waiting up to 3 s" in done.stderr
+    done = softfinger("send", "arm", "--address", addresses[1], "--timeout", "1.5")
+    assert f"no reply to arm from {addresses[1]} yet; waiting up to 1.5 s" in done.stderr
     done = inline("send", "grasp", "force:5", "--address", addresses[1])
     assert done.returncode == 2
     assert "found 'force:5', expected key=number" in done.stderr

@@ -29,9 +29,10 @@ from softfinger import (
     WrongThread,
 )
 from softfinger.daemon.client import command_client, connection
+from softfinger.daemon.client import stream as stream_module
 from softfinger.daemon.client.asynchronous import AsyncSubscription
 from softfinger.daemon.client.command_client import UNCONFIRMED_TEXT
-from softfinger.daemon.client.connection import SILENCE_TIME, still_waiting
+from softfinger.daemon.client.connection import still_waiting
 from softfinger.daemon.client.hand import Subscription
 from softfinger.daemon.client.stream import Gaps, read, to_columns
 from softfinger.daemon.errors import HandClosed, SettingsError
@@ -41,8 +42,6 @@ from tests.conftest import until
 from tests.harness import fake_daemon
 from tests.harness.daemon_process import python
 from tests.harness.fake_daemon import FakeDaemon
-
-IN_VAIN = 6.0  # timeout [s] of waits that must fail
 
 
 @pytest.fixture
@@ -92,8 +91,11 @@ def test_grasp_turn_and_release_with_asyncio(daemon):
             assert [each.seq for each in states] == sorted({each.seq for each in states})
             await hand.arm()  # The hand is already armed.
             assert (await hand.state()).mode == "holding"
-            with pytest.raises(NotInTime, match="mode holding"):
-                await hand.wait_for(lambda state: state.mode == "releasing", IN_VAIN)
+            arrived: list[HandState] = []
+            hand._now = lambda: 20.0 * len(arrived)  # Each state takes 20 s.
+            with pytest.raises(NotInTime, match="not met within 60 s; last state: mode holding"):
+                await hand.wait_for(arrived.append, 60.0)
+            assert len(arrived) == 3
             return held.mode, seen
 
     assert asyncio.run(session()) == ("holding", 44 * 44)
@@ -108,14 +110,19 @@ def test_a_fault_ends_a_wait(fake, hand):
 
 
 def test_a_wait_times_out_with_the_last_state(hand):
-    with pytest.raises(NotInTime, match="not met within 6 s; last state: mode holding"):
-        hand.wait_for(lambda state: state.mode == "released", IN_VAIN)
+    arrived: list[HandState] = []
+    hand._now = lambda: 20.0 * len(arrived)  # Each state takes 20 s.
+    with pytest.raises(NotInTime, match="not met within 60 s; last state: mode holding"):
+        hand.wait_for(arrived.append, 60.0)  # `append` returns None, so the condition is never met.
+    assert len(arrived) == 3
 
 
-def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
+def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog, monkeypatch):
+    for module in (command_client, stream_module):
+        monkeypatch.setattr(module, "SILENCE_TIME", 0.05)
     stream, commands = addresses
-    timeout = SILENCE_TIME + 0.05
-    unanswered = rf"no reply to arm from {commands} within 1\.05 s"
+    timeout = 0.5
+    unanswered = rf"no reply to arm from {commands} within 0\.5 s"
 
     async def ask() -> None:
         async with AsyncHand(*addresses, timeout=timeout) as hand:
@@ -125,14 +132,14 @@ def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog):
                 await hand.command("arm")
 
     with Hand(*addresses, timeout=timeout) as hand:
-        with pytest.raises(NoStream, match=r"no hand/state from tcp://.* within 1\.05 s; is softf"):
+        with pytest.raises(NoStream, match=r"no hand/state from tcp://.* within 0\.5 s; is softf"):
             hand.state()
         with pytest.raises(NoAnswer, match=unanswered):
             hand.arm()
     asyncio.run(ask())
     said = [
-        f"no hand/state from {stream} yet; waiting up to 1.05 s",
-        f"no reply to arm from {commands} yet; waiting up to 1.05 s",
+        f"no hand/state from {stream} yet; waiting up to 0.5 s",
+        f"no reply to arm from {commands} yet; waiting up to 0.5 s",
     ]
     assert caplog.messages == said + said
 

@@ -112,7 +112,7 @@ def test_a_port_that_cannot_be_opened_is_reported(tmp_path, board):
     with serial.Serial(board.path, 2_000_000, exclusive=True):
         assert "the port is in use by another program" in why_not_open(sensor(board.path))
     board.stream(lambda k: bytes(1024))
-    assert "no AA 55 marker" in why_not_open(sensor(board.path, timeout=5.0))
+    assert "no AA 55 marker" in why_not_open(sensor(board.path, timeout=1.0))
 
 
 def test_a_port_that_is_lost_while_it_is_opened_is_reported(board, monkeypatch):

@@ -32,6 +32,7 @@ from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
+from softfinger.tools.viewing import sources
 from softfinger.tools.viewing.document import save
 from softfinger.tools.viewing.page import listen
 from softfinger.tools.viewing.pictures import COLUMNS, TOPICS, Pictures, Row
@@ -598,6 +599,7 @@ def test_waiting_is_reported_and_ended_by_a_signal() -> None:
 )
 def test_invalid_input_is_reported_in_one_line(tmp_path, inline, monkeypatch, words, reason):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sources, "WAIT_MAX", 0.1)
     (tmp_path / "text.mcap").write_text("no recording")
     done = inline("view", "--no-browser", *words)
     assert done.returncode in (1, 2)
