@@ -125,11 +125,13 @@ def in_place(daemon: Daemon, rate: float) -> list[float]:
     return samples
 
 
-def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) -> Report:
+def in_the_loop(
+    title: str, turns: int, baud: int, changes: Sequence[str] = (), patience: int = 10
+) -> Report:
     """While holding an object, time complete ticks and plain servo exchanges over ptys alternately.
 
     A ``baud`` of 0 disables pacing, and ``changes`` override the profile. Raises RigError if the
-    hand loses its grip, e.g. on a busy machine.
+    hand does not hold the object within ``patience`` [s], or loses it, e.g. on a busy machine.
     """
     in_place: list[float] = []
     back_to_back: list[float] = []
@@ -139,7 +141,7 @@ def in_the_loop(title: str, turns: int, baud: int, changes: Sequence[str] = ()) 
         daemon = stack.enter_context(Daemon(load(Path("hil"), folder, changes), wire=False))
         stack.enter_context(RealTime(daemon.settings))
         loop, clock, state = daemon.loop, daemon.clock, daemon.loop.state
-        hold(daemon)
+        hold(daemon, patience)
         servos = loop.torque.servos
         assert servos is not None
 
@@ -187,17 +189,18 @@ def virtual_daemon(*topics: bytes) -> Iterator[Daemon]:
                 context.destroy()
 
 
-def hold(daemon: Daemon) -> None:
+def hold(daemon: Daemon, patience: int = 10) -> None:
     """Grasp the simulated object with 8 N.
 
-    Raises RigError if the object is not held within 10 s, and Refused if a command is refused.
+    Raises RigError if the object is not held within ``patience`` [s] of the machine's time, and
+    Refused if a command is refused.
     """
     loop = daemon.loop
     loop.advance(0.2)
     loop.command({"command": "arm"})
     loop.advance(0.2)
     loop.command({"command": "grasp", "force": 8.0})
-    for _ in range(10):
+    for _ in range(patience):
         loop.advance(1.0)
         if loop.state.mode == "holding":
             break
