@@ -121,24 +121,35 @@ def test_frequent_resubscriptions_do_not_repeat_all_messages_each_time(
     assert not reader.poll(50)
 
 
-def test_unread_replies_are_dropped(served, context, addresses):
+def test_unread_replies_are_dropped(served, context, addresses, clock):
     """Unread replies cannot block the gateway or fill the memory, because the queue is limited."""
     client = context.socket(zmq.DEALER)
     client.setsockopt(zmq.RCVHWM, 1)
     client.setsockopt(zmq.RCVBUF, 4096)
     client.connect(addresses[1])
-    asked, most = 0, 2000
-    long = {"told": "x" * 20_000}
-    while asked < most:
-        client.send(msgpack.packb({"command": "status"}))
-        asked += 1
-        served.serve(lambda *_: long)
+    status = msgpack.packb({"command": "status"})
+    long, answered, read = {"told": "x" * 20_000}, list[object](), list[bytes]()
+
+    def all_answered() -> bool:
+        for _ in range(20):
+            client.send(status)
+            clock.sleep_until(clock.now() + 2.0 / bounds.TOTAL_RATE)
+            served.serve(lambda *_: answered.append(None) or long)
+        return len(answered) >= 2000
+
+    def all_read() -> bool:
+        """Ask once more: if the reply is not dropped, it follows all kept replies."""
+        client.send(status)
+        served.serve(lambda *_: {"told": "last"})
+        while client.poll(0):
+            read.append(client.recv())
+        return bool(read) and msgpack.unpackb(read[-1]).get("told") == "last"
+
+    until(all_answered)
     assert is_served(served, context, addresses[1])
-    read = 0
-    while client.poll(200):
-        client.recv()
-        read += 1
-    assert read < most
+    until(all_read)
+    kept = sum(len(reply) > 20_000 for reply in read)
+    assert 0 < kept < 2000
 
 
 def test_many_connections_do_not_limit_a_client_while_the_total_rate_is_low(addresses, context):
