@@ -63,7 +63,7 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("turn", "told"),
     [
-        ("left={pose} right={pose}", "servos 1 and 2 rotated, expected one servo: move only one"),
+        ("left={pose} right={pose}", "servos 2 and 1 rotated, expected one servo: move only one"),
         ("left={pose}", "servo 2 rotated when either finger was moved"),
         ("left=ajar", "exited with status 1"),
     ],
@@ -71,8 +71,7 @@ def test_a_wrong_profile_is_corrected(hand, tmp_path, capsys):
 def test_moving_the_wrong_finger_is_refused(hand, tmp_path, capsys, turn, told):
     folder, _ = hand
     assert calibrate(folder, tmp_path / "a.toml", "--config", "hil", *by_hand(folder, turn)) == 1
-    error = capsys.readouterr().err
-    assert told in error or "servos 2 and 1 rotated" in error
+    assert told in capsys.readouterr().err
     assert not (tmp_path / "a.toml").exists()
 
 
