@@ -120,8 +120,10 @@ def test_a_task_that_a_client_ends_recomputes_bitwise(tmp_path):
 
 def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_path, inline):
     path = tmp_path / "run.mcap"
+    # At this low data rate, no messages are lost while the recorder waits for a processor.
+    slow = "tactile.rows = 16\ntactile.cols = 16\ntactile.pitch = 0.0036\ntactile.rate = 20.0\n"
     words = ("--duration", "3", "--set", "task.name=demo", "--record", str(path))
-    done = softfinger("run", "--config", str(profile("")), *words, *PATIENT)
+    done = softfinger("run", "--config", str(profile(slow)), *words, *PATIENT)
     assert done.returncode == 0, done.stderr
     assert "lost: none" in done.stderr
     told = inline("replay", path, "--recompute")
@@ -133,7 +135,7 @@ def test_a_daemon_recorded_from_its_first_tick_recomputes_bitwise(profile, tmp_p
     assert int(ticks[1]) > 100
     # The changed setting changes the goals, even if a slow machine prevented the grip.
     other = tmp_path / "other.toml"
-    other.write_text(profile("safety.current_move = 0.3\n", "base.toml").read_text())
+    other.write_text(profile(slow + "safety.current_move = 0.3\n", "base.toml").read_text())
     told = inline("replay", path, "--recompute", "--config", other)
     assert told.returncode == 3
     assert "left.goal_current" in told.stdout
