@@ -1,5 +1,6 @@
 """Test that every tactile backend meets the requirements for backends."""
 
+import re
 import threading
 
 import numpy as np
@@ -98,20 +99,23 @@ def test_another_grid_is_reported_with_both_sizes(backend, tmp_path):
     def told() -> bool:
         with pytest.raises(TactileError) as error, Rig(backend, tmp_path, rows=16) as rig:
             rig.sensor.open()
-        return "16 × 32" in str(error.value)
+        text = str(error.value)
+        assert re.search("expected .*16 × 32|no data|found no packet", text), text
+        # On a busy machine, the board may not have sent a complete frame.
+        return re.search("1024 cells|2063 bytes|32 × 32 cells", text) is not None
 
-    until(told)  # On a busy machine, the board may still not have sent a frame.
+    until(told)
 
 
 @pytest.mark.parametrize("backend", SERIAL)
 def test_incomplete_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
     with Rig(backend, tmp_path, fault="torn=0.3") as rig:
         rig.sensor.open()
-        wrong = 0
-        while rig.sensor.counters()["resyncs"] < 4:
-            frame = rig.wait(lambda frame: True)
-            wrong += not any(np.array_equal(frame.data, image(k)) for k in range(160))
-        assert wrong == 0
+        seen: set[int] = set()
+        while len(seen) < 10 or rig.sensor.counters()["resyncs"] < 4:
+            frame = rig.wait(lambda frame: frame.seq not in seen)
+            seen.add(frame.seq)
+            assert any(np.array_equal(frame.data, image(k)) for k in range(160))
         assert rig.sensor.counters()["skipped_bytes"] > 0
 
 
