@@ -2,6 +2,7 @@
 
 import os
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.clock import RealClock
 from softfinger.daemon.errors import PluginError, SettingsError
 from softfinger.daemon.profile.load import load
+from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.emulator.pty_bus import PtyPort
+from softfinger.daemon.simulation.simulated_tactile import SimulatedTactile
+from softfinger.daemon.types import Frame, Reading
 from softfinger.testing import check_servos, check_shape, check_tactile
 from softfinger.tools.setup import doctor
 from tests.conftest import until
@@ -56,6 +60,26 @@ def test_the_checks_support_backends_that_use_the_simulated_hand(servos, clock):
     settings = load(changes=[f"servos.backend={servos}", f"loop.clock={clock}"])
     check_tactile(settings)
     check_servos(settings, torque=True)
+
+
+def test_times_in_the_future_are_found_in_virtual_time(monkeypatch):
+    settings = load(changes=["loop.clock=virtual"])
+    latest, read = SimulatedTactile.latest, SimulatedServos.read
+
+    def early_frame(sensor: SimulatedTactile) -> Frame | None:
+        frame = latest(sensor)
+        return frame and replace(frame, t_arrival=frame.t_arrival + 0.1)
+
+    def early_reading(servos: SimulatedServos, reading: Reading) -> None:
+        read(servos, reading)
+        reading.t += 0.1
+
+    monkeypatch.setattr(SimulatedTactile, "latest", early_frame)
+    monkeypatch.setattr(SimulatedServos, "read", early_reading)
+    with pytest.raises(AssertionError, match="arrival time in the future"):
+        check_tactile(settings)
+    with pytest.raises(AssertionError, match="a reading with a time in the future"):
+        check_servos(settings)
 
 
 @pytest.mark.usefixtures("here")
