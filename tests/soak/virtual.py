@@ -670,12 +670,8 @@ class Soak:
             self._uncovered_t = self.daemon.loop.state.t
         for name in self._doubts(mode in _GRIPPING):
             self._names(name)
-        if mode not in HONEST:
-            return
-        if self._lie:
-            self.must(NAMED[self._lie], True)
-        elif not self._false:
-            self.must(LOADED if self._loaded else HONEST[mode], True)
+        if mode in HONEST and (self._lie or not self._false) and not self._exempt():
+            self.must(self._naming(), True)
 
     def _doubts(self, held: bool) -> Iterator[str]:
         """Yield the measurement channels that the estimator currently treats as faulty."""
@@ -694,14 +690,20 @@ class Soak:
 
     def _names(self, name: str) -> None:
         """Check that the reported channel is faulty, unless a footprint just left the object."""
-        t = self.daemon.loop.state.t
         wrong = self._lie or self.servos.fault or "".join(each.fault for each in self.sensors)
         self.account.named[f"{name} ({wrong or ('load' if self._loaded else 'nothing')})"] += 1
-        if t > self._uncovered_t + _UNCOVERED:
-            judged = NAMED.get(self._lie, LOADED)
-            self.must(
-                judged, name in self._false, f"{name} named, wrong is {self._false or 'none'}"
-            )
+        if not self._exempt():
+            found = f"{name} named, wrong is {self._false or 'none'}"
+            self.must(self._naming(), name in self._false, found)
+
+    def _exempt(self) -> bool:
+        """Return True if a footprint just left the object."""
+        return self.daemon.loop.state.t <= self._uncovered_t + _UNCOVERED
+
+    def _naming(self) -> str:
+        """Return the requirement that currently restricts the reported channels."""
+        honest = LOADED if self._loaded else HONEST.get(self.daemon.loop.state.mode, LOADED)
+        return NAMED.get(self._lie, honest)
 
     def _covered(self) -> bool:
         """Return True if the footprints of both tips are on the object's faces in the plant."""
