@@ -273,7 +273,6 @@ def test_a_watchdog_trip_stops_the_servos_and_is_reported(bus, connect):
     assert backend.torque_off(Reading())
     backend.torque_on()
     backend.write(Goal(q=[0.1, 0.1], current=[0.2, 0.2]))
-    assert backend.counters()["timeouts"] == 0
 
 
 @pytest.mark.parametrize(
