@@ -365,11 +365,16 @@ def _has_jumped(
     yield1 = sign * (s.speed[0] - dq[0])
     yield2 = sense * sign * (s.speed[1] - dq[1])
     last = 0.5 * (s.residual[0] + sense * s.residual[1])
-    last -= s.offset if kind == 0 else clip(last, s.joint_friction)
-    if min(yield1, yield2) <= s.law.yield_speed or abs(last + change) <= abs(last):
+    now = last + change
+    if kind == 0:
+        last, now = _load_torque(s, last), _load_torque(s, now)
+    else:
+        friction = clip(last, s.joint_friction)
+        last, now = last - friction, now - friction
+    if min(yield1, yield2) <= s.law.yield_speed or abs(now) <= abs(last):
         return False
     curvature = grasp.load_curvature if kind == 0 else 0.0
-    load, slope = load_of(last + change, grasp.load_arm, curvature)
+    load, slope = load_of(now, grasp.load_arm, curvature)
     hidden = s.joint_friction / max(slope, s.law.arm_min)
     has_jumped: bool = abs(load) + 0.5 * hidden > sudden_min
     return has_jumped
@@ -404,10 +409,7 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     )  # A load acts on both joints.
     s.holding_time = min(s.holding_time + law.dt, _SETTLING_TIME)
     _update_offset(s, grasp, residual, torque_change)
-    # If the residual changes because friction decreases or reverses, the change is not a load.
-    deviation = residual - s.offset
-    increase = residual - s.start_offset
-    s.deviation = min(max(deviation, min(increase, 0.0)), max(increase, 0.0))
+    s.deviation = _load_torque(s, residual)
     load, slope = load_of(s.deviation, grasp.load_arm, grasp.load_curvature)
     load = abs(load)
     hidden = s.joint_friction / grasp.load_arm
@@ -417,6 +419,17 @@ def _estimate_load(s: SlipState, grasp: GraspState, torque_change: float) -> Non
     ignored = 0.5 * hidden
     hidden = s.joint_friction / max(slope, law.arm_min)
     s.load = min(max(4.0 * (load - ignored), 0.0), load + hidden, law.tip_friction * s.force_limit)
+
+
+@inner_kernel
+def _load_torque(s: SlipState, residual: float) -> float:
+    """Return the part of a mean ``residual`` [N·m] that a load explains.
+
+    If the residual changes because friction decreases or reverses, or because a load ends that the
+    offset has followed, the change is not a load.
+    """
+    increase = residual - s.start_offset
+    return min(max(residual - s.offset, min(increase, 0.0)), max(increase, 0.0))
 
 
 @inner_kernel

@@ -108,6 +108,18 @@ def test_a_sudden_load_immediately_raises_the_grip_by_the_maximum():
     assert state.grip_force == pytest.approx(FORCE + 10.0, rel=0.03)
 
 
+@pytest.mark.parametrize(("duration", "raised"), [(3.0, False), (0.0, True)])
+def test_the_end_of_a_load_that_the_offset_has_followed_is_not_a_sudden_load(duration, raised):
+    """A load within the joint friction cannot be distinguished from friction after some time."""
+    watched = at_rest(6.0)
+    for load in np.linspace(0.0, 0.95 * FRICTION, 500) * (duration > 0.0):
+        watched.run(load, 1, normal=6.0)
+    watched.run(0.95 * FRICTION * (duration > 0.0), round(500 * duration), normal=6.0)
+    end = 0.0 if duration else -0.95 * FRICTION
+    watched.run(end, 1, normal=6.0, speed=-GIVES_WAY)
+    assert watched.grip.slip.reflex_triggered == raised
+
+
 def test_a_sudden_twist_immediately_raises_the_grip():
     for speed, raised in ((0.0, 0.0), (-GIVES_WAY, 0.0), (GIVES_WAY, 10.0)):
         watched = at_rest()
