@@ -291,7 +291,8 @@ def predict(
     if is_gripping and not h.is_gripping:  # An approach begins.
         for k in range(2):
             _restart_free_torque(h, k, t)
-            h.grasp.free_torque[k] = 0.0
+            if not h.tip[k].in_contact:
+                h.grasp.free_torque[k] = 0.0
     h.is_gripping = is_gripping
     if not is_gripping:
         h.grasp.rejects_frames[:] = 0.0
