@@ -377,9 +377,8 @@ class Control:
             return state.current
         if not isinstance(state, Approaching):
             return self._settings.safety.current_move
-        # The tip may reach the object before the sensor detects contact. Limit the tip force to
-        # half of the commanded force. The other half is a reserve for a wrong torque constant and
-        # for the momentum of the finger.
+        # The tip may reach the object before the sensor detects contact. Limit the current so that
+        # the tip force stays well below the commanded force.
         pressed = 0.5 * state.command.force * self._settings.hand.finger_length * law.driving
         # The joint friction may exceed the setting. Therefore, also allow for `free_torque`, the
         # friction torque measured in free motion. Otherwise, the joint might not move at the

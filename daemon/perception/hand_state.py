@@ -385,8 +385,8 @@ def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
     """Advance the joints by ``step`` [rad] in ``dt`` seconds, and move the tips and the object.
 
     If both tips are in contact, the object rotates by turn1 Δq1 − turn2 Δq2, and each displacement
-    changes by half the change in d1 + d2 (docs/estimation.md). Otherwise, the object does not move,
-    and each joint moves only its own tip.
+    changes by half the change in d1 + d2 (docs/estimation.md). Otherwise, the object is assumed to
+    be at rest, and each joint moves only its own tip.
     """
     left = h.tip[0]
     right = h.tip[1]

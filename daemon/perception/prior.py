@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 MODULUS_ERROR = 0.2  # relative modulus error of an uncalibrated tip
 CALIBRATED_ERROR = 0.05  # relative modulus error after `softfinger calibrate modulus`
-# Typical relative force loss in a hold if `tip.relaxation` is not set. Silicone rubber loses a few
-# percent to 15 % within a minute.
+# Assumed relative force loss in a hold if `tip.relaxation` is not set. Simulated tips with unset
+# relaxation lose 7 to 17 % (docs/accuracy.md); no real tip has been measured.
 RELAXATION_ERROR = 0.07
 
 
