@@ -53,11 +53,11 @@ class Fingers:
         """Return the minimum and maximum angle [rad] to which this grip can rotate the object.
 
         When the object rotates by φ, each joint rotates by ψ = φ/(r1 + r2). The factors r1 and r2
-        are in `GraspState.jacobian_rotation`. The tilt of each tip then changes by φ + ψ. The joint
+        are in `GraspState.rolling_ratio`. The tilt of each tip then changes by φ + ψ. The joint
         and tilt limits determine the range.
         """
         settings, present_angle = self._settings, self.pose.angle
-        rotation = self.grasp.jacobian_rotation[0] + self.grasp.jacobian_rotation[1]
+        rotation = self.grasp.rolling_ratio[0] + self.grasp.rolling_ratio[1]
         joint_ratio = 1.0 / max(rotation, ROTATION_MIN)
         low, high = -math.inf, math.inf
         for index, sense in ((0, 1.0), (1, -1.0)):

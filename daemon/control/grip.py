@@ -11,7 +11,7 @@ moves. Every control law therefore has two parts:
    controller from the literature on soft fingertips. The integral of the angle error is added to
    the goal of one joint and subtracted from the goal of the other joint. A PD controller makes the
    joints follow their goals. The object rotates at φ̇ = r1 q̇1 − r2 q̇2
-   (`GraspState.jacobian_rotation`).
+   (`GraspState.rolling_ratio`).
 
 If ``control.law`` is ``"energy"``, the moment arms are computed from the gradient of the tips'
 elastic energy. The contact table stores the elastic energy. The computation assumes that the tips

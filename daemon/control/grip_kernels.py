@@ -204,7 +204,7 @@ def _mean_stiffness(grasp: GraspState) -> float:
 @inner_kernel
 def _rotation_per_offset(grasp: GraspState) -> float:
     """Return the derivative of the object angle with respect to the antisymmetric joint angle."""
-    rotation_per_offset: float = grasp.jacobian_rotation[0] + grasp.jacobian_rotation[1]
+    rotation_per_offset: float = grasp.rolling_ratio[0] + grasp.rolling_ratio[1]
     return max(rotation_per_offset, ROTATION_MIN)
 
 
@@ -284,9 +284,9 @@ def _closing_rate(g: GripState, grasp: GraspState, rate: float) -> float:
     The closing rate also compensates for a rotation of the object.
     """
     arm = grasp.moment_arm
-    rotation = grasp.jacobian_rotation
+    rotation = grasp.rolling_ratio
     d_rate = 2.0 * rate / _mean_stiffness(grasp)
-    d_rate -= (arm[0] - arm[1] + grasp.jacobian_slide * (rotation[0] + rotation[1])) * g.offset_rate
+    d_rate -= (arm[0] - arm[1] + grasp.slide * (rotation[0] + rotation[1])) * g.offset_rate
     closing: float = d_rate / (arm[0] + arm[1])
     return closing
 

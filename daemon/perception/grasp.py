@@ -33,8 +33,8 @@ class GraspState(Record):
 
     # Moment arms
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]
-    jacobian_rotation: Pair  # r1, r2 in φ̇ = r1 q̇1 − r2 q̇2
-    jacobian_slide: float  # ∂(d1 + d2)/∂φ [m/rad]
+    rolling_ratio: Pair  # r1, r2 in φ̇ = r1 q̇1 − r2 q̇2
+    slide: float  # ∂(d1 + d2)/∂φ [m/rad]
     energy_arm: Pair  # joint torque per unit of tip force, computed from the energy gradient [m]
 
     # A load L along the object faces changes the mean torque residual by load_arm L +

@@ -219,10 +219,10 @@ def write_grasp(hands: Records[HandFilter], table1: FloatArray, table2: FloatArr
     dt = h.t - grasp.t
     grasp.t = h.t
     grasp.angle_std = math.sqrt(max(h.covariance[ANGLE, ANGLE], 0.0))
-    grasp.jacobian_slide = motion.slide
+    grasp.slide = motion.slide
     for k in range(2):
-        grasp.moment_arm[k] = motion.arm[k]
-        grasp.jacobian_rotation[k] = motion.turn[k]
+        grasp.moment_arm[k] = motion.moment_arm[k]
+        grasp.rolling_ratio[k] = motion.rolling_ratio[k]
     _write_load(h, table1, table2, theta, motion)
     _write_shear(h)
     has_new_frame = left.has_new_frame or right.has_new_frame

@@ -384,29 +384,29 @@ def interpolate(first: float, last: float, fraction: float) -> float:
 def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
     """Advance the joints by ``step`` [rad] in ``dt`` seconds, and move the tips and the object.
 
-    If both tips are in contact, the object rotates by turn1 Δq1 − turn2 Δq2, and each displacement
+    If both tips are in contact, the object rotates by r1 Δq1 − r2 Δq2, and each displacement
     changes by half the change in d1 + d2 (docs/estimation.md). Otherwise, the object is assumed to
     be at rest, and each joint moves only its own tip.
     """
     left = h.tip[0]
     right = h.tip[1]
     motion = motion_of(h)
-    arm1, arm2 = motion.arm
-    turn1, turn2 = motion.turn
+    arm1, arm2 = motion.moment_arm
+    r1, r2 = motion.rolling_ratio
     # Before contact, the gap shrinks at the rate at which d grows during contact.
     both = left.in_contact and right.in_contact
     by1, by2 = arm1, arm2
     if both:
-        by1 = 0.5 * (arm1 + motion.slide * turn1)
-        by2 = 0.5 * (arm2 - motion.slide * turn2)
+        by1 = 0.5 * (arm1 + motion.slide * r1)
+        by2 = 0.5 * (arm2 - motion.slide * r2)
     else:
-        turn1 = turn2 = 0.0
+        r1 = r2 = 0.0
     step1, step2 = step
     d_step1 = by1 * step1
     d_step2 = by2 * step2
     if both:
         d_step1 = d_step2 = d_step1 + d_step2
-    rotation = turn1 * step1 - turn2 * step2
+    rotation = r1 * step1 - r2 * step2
     left.q += step1
     right.q += step2
     left.travel[1] += step1
@@ -434,8 +434,8 @@ def _move(h: HandFilter, step: FloatPair, dt: float) -> None:
         else:
             _walk(h, D, relative * d_step1, 1.0)
             _walk(h, D + 1, relative * d_step2, 1.0)
-    _add_rounding_noise(h, 0, by1, turn1, both, dt)
-    _add_rounding_noise(h, 1, by2, -turn2, both, dt)
+    _add_rounding_noise(h, 0, by1, r1, both, dt)
+    _add_rounding_noise(h, 1, by2, -r2, both, dt)
 
 
 @inner_kernel

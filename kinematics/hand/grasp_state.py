@@ -41,11 +41,12 @@ class Lengths(NamedTuple):
 class HeldMotion(NamedTuple):
     """Jacobian and width of a held object; see :func:`held_motion`."""
 
-    arm: FloatPair  # ∂(d1 + d2)/∂q [m]
-    turn: FloatPair  # rolling ratios in φ̇ = turn1 q̇1 − turn2 q̇2
+    moment_arm: FloatPair  # ∂(d1 + d2)/∂q, the moment arms of the normal forces [m]
+    shear_arm: FloatPair  # moment arms of the shear forces [m]
+    rolling_ratio: FloatPair  # r1, r2 in φ̇ = r1 q̇1 − r2 q̇2
     slide: float  # ∂(d1 + d2)/∂φ [m/rad]
     width: float  # distance between the contacts [m]
-    across: float  # the same along the bisector's normal, W [m]
+    across: float  # W in the equations; at least half the tip radius [m]
 
 
 class HoldingForces(NamedTuple):
@@ -83,20 +84,20 @@ def held_motion(
     The vector v_i is the derivative of tip position i with respect to q_i. If the tips roll without
     slip and both displacements change by the same amount,
 
-        φ̇ = turn1 q̇1 − turn2 q̇2      turn_i W = a − d_i − v_i·t/cos(α/2)
+        φ̇ = r1 q̇1 − r2 q̇2      r_i = b_i/W      b_i = a − d_i − v_i·t/cos(α/2)
         ḋ1 + ḋ2 = arm1 q̇1 + arm2 q̇2 + slide φ̇
         arm_i = ±v_i·n/cos(α/2) − tan(α/2) (a − d_i)
         slide = (O1 − O2)·t/cos(α/2) + tan(α/2) (d1 − d2)
 
     where n and t belong to the bisector's ``angle`` φ, and α is the ``taper`` [rad]. The object
-    moves along t as the tips roll and approach each other. For parallel faces, arm [m] is the
-    moment arm of the normal force about the pivot. In a symmetric grasp, turn1 + turn2 equals 2 (a
-    − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m]. The
-    distance between the contacts along n is ``width`` = W cos(α/2).
+    moves along t as the tips roll and approach each other. For parallel faces, arm_i and b_i [m]
+    are the moment arms of the normal force and of the shear force about the pivot. In a symmetric
+    grasp, r1 + r2 equals 2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 −
+    O1)·n/cos(α/2) [m]. The distance between the contacts along n is ``width`` = W cos(α/2).
 
-    In turn_i, W is clamped to at least half the tip radius, because the prediction would diverge
-    for thinner objects. In reality, inertia and the shear compliance of the tips slow the rotation
-    of thin objects.
+    W is clamped to at least half the tip radius, because the rotation and the shear forces would
+    diverge for thinner objects. In reality, inertia and the shear compliance of the tips slow the
+    rotation of thin objects.
     """
     q1, q2 = q
     d1, d2 = d
@@ -113,14 +114,15 @@ def held_motion(
     bounded = max(across, 0.5 * radius)
     arm1 = longer * (vx1 * nx + vy1 * ny) - face_slope * (radius - d1)
     arm2 = -longer * (vx2 * nx + vy2 * ny) - face_slope * (radius - d2)
-    turn1 = (radius - d1 - longer * (vy1 * nx - vx1 * ny)) / bounded
-    turn2 = (radius - d2 - longer * (vy2 * nx - vx2 * ny)) / bounded
+    shear_arm1 = radius - d1 - longer * (vy1 * nx - vx1 * ny)
+    shear_arm2 = radius - d2 - longer * (vy2 * nx - vx2 * ny)
     return HeldMotion(
         (arm1, arm2),
-        (turn1, turn2),
+        (shear_arm1, shear_arm2),
+        (shear_arm1 / bounded, shear_arm2 / bounded),
         longer * ((y1 - y2) * nx - (x1 - x2) * ny) + face_slope * (d1 - d2),
         across / longer,
-        across,
+        bounded,
     )
 
 
@@ -166,22 +168,22 @@ def holding_forces(
     The torques are the gradient of the energy along the rolling ``motion`` from
     :func:`held_motion`:
 
-        τ1 = N arm1 + ∂U1/∂θ1 + T W turn1      τ2 = N arm2 − ∂U2/∂θ2 − T W turn2
+        τ1 = N arm1 + ∂U1/∂θ1 + T b1      τ2 = N arm2 − ∂U2/∂θ2 − T b2
 
-    T is the mean shear force. The moment equilibrium of the object requires T W = N slide + ∂U1/∂θ1
-    + ∂U2/∂θ2. Faces with a ``taper`` α [rad] push the object out. The shear force is therefore T −
-    N tan(α/2) at the left tip and T + N tan(α/2) at the right tip. F is the mean contact force of
-    both tips. A modulus that is common to both tips therefore cancels in the moment arms τ/F [m]. N
-    is the mean of the normal forces N1 and N2 [N]. N1 and N2 differ if the object rubs against its
-    surroundings. ``data1`` and ``data2`` are the arrays of the contact tables. All results are zero
-    unless both tips are in contact.
+    T is the mean shear force, and b_i are its moment arms. The moment equilibrium of the object
+    requires T W = N slide + ∂U1/∂θ1 + ∂U2/∂θ2. Faces with a ``taper`` α [rad] push the object out.
+    The shear force is therefore T − N tan(α/2) at the left tip and T + N tan(α/2) at the right tip.
+    F is the mean contact force of both tips. A modulus that is common to both tips therefore
+    cancels in the moment arms τ/F [m]. N is the mean of the normal forces N1 and N2 [N]. N1 and N2
+    differ if the object rubs against its surroundings. ``data1`` and ``data2`` are the arrays of
+    the contact tables. All results are zero unless both tips are in contact.
     """
     d1, d2 = d
     theta1, theta2 = theta
     if not (d1 > 0.0 and d2 > 0.0):
         return HoldingForces((0.0, 0.0), 0.0, (0.0, 0.0))
-    arm1, arm2 = motion.arm
-    turn1, turn2 = motion.turn
+    arm1, arm2 = motion.moment_arm
+    shear_arm1, shear_arm2 = motion.shear_arm
     contact1 = lookup(data1, d1, theta1)
     contact2 = lookup(data2, d2, theta2)
     tangential = normal = normal1 = normal2 = turning1 = turning2 = 0.0
@@ -197,9 +199,8 @@ def holding_forces(
         normal = 0.5 * (normal1 + normal2)
         tangential = (normal * motion.slide + turning1 + turning2) / motion.across
     force = 0.5 * (contact1.force + contact2.force)
-    moment = tangential * motion.across
-    torque1 = normal * arm1 + turning1 + moment * turn1
-    torque2 = normal * arm2 - turning2 - moment * turn2
+    torque1 = normal * arm1 + turning1 + tangential * shear_arm1
+    torque2 = normal * arm2 - turning2 - tangential * shear_arm2
     return HoldingForces((torque1 / force, torque2 / force), tangential, (normal1, normal2))
 
 
@@ -215,7 +216,7 @@ def _unexplained(
     shear: float,
     torque: float,
     arm: float,
-    moment_arm: float,
+    shear_arm: float,
 ) -> tuple[float, float, float]:
     """Return the residual torque [N·m] of one finger, and its coefficients for −T and −T².
 
@@ -243,10 +244,10 @@ def _unexplained(
     theta_tt = (
         contact.force_theta * depth_change_tt - force * d * shear_ratio_t * sine * shear_ratio_t
     )
-    remaining = side * (torque - (by_d - shear * tangent) * arm) - by_theta - shear * moment_arm
+    remaining = side * (torque - (by_d - shear * tangent) * arm) - by_theta - shear * shear_arm
     return (
         remaining,
-        side * arm * normal_t + theta_t + moment_arm,
+        side * arm * normal_t + theta_t + shear_arm,
         side * arm * normal_tt + theta_tt,
     )
 
@@ -267,14 +268,14 @@ def load_torques(
     δ1 and δ2 [N·m] are the parts of the joint torques that only a load along the object's t axis
     can cause. If the total load is 2 L [N], half of it at each tip, the torques are
 
-        τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 lever1      T1 = rolled1 + L      lever_i = a − d_i − v_i·t_i
-        τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 lever2     T2 = rolled2 − L
+        τ1 = N1 v1·n1 + ∂U1/∂θ1 + T1 c1      T1 = rolled1 + L      c_i = a − d_i − v_i·t_i
+        τ2 = −N2 v2·n2 − ∂U2/∂θ2 − T2 c2     T2 = rolled2 − L
 
     where n_i and t_i belong to the face at each tip. ``rolled`` [N] are the shear forces without a
     load, computed by :func:`holding_forces`. Without a load, rolling, the turning moments and
     the ``taper`` [rad] cause the shear forces. N and ∂U/∂θ include the effect of the shear forces.
-    ``motion`` is the result of :func:`held_motion`. For parallel faces, ±v_i·n equals arm_i and
-    lever_i equals W turn_i.
+    ``motion`` is the result of :func:`held_motion`. For parallel faces, ±v_i·n and c_i equal
+    the moment arms in ``motion``.
 
     δ_i is the residual of τ_i at L = 0. A load causes exactly (δ1 + δ2)/2 = arm L + curvature L².
     All results are zero if a tip is not in contact or if a load would not change the torques.
@@ -284,21 +285,20 @@ def load_torques(
     none = LoadModel((0.0, 0.0), 0.0, 0.0)
     if not (d1 > 0.0 and d2 > 0.0):
         return none
-    arm1, arm2 = motion.arm
-    turn1, turn2 = motion.turn
-    across = motion.across
+    arm1, arm2 = motion.moment_arm
+    shear_arm1, shear_arm2 = motion.shear_arm
     # Remove the motion along the bisector, because it does not contribute to the moment arms.
     face_slope = math.tan(0.5 * taper)
     scale = 1.0 / (1.0 + face_slope * face_slope)
-    moment_arm1 = scale * (across * turn1 - face_slope * arm1)
-    moment_arm2 = scale * (across * turn2 - face_slope * arm2)
-    arm1 = scale * (arm1 + face_slope * across * turn1)
-    arm2 = scale * (arm2 + face_slope * across * turn2)
+    normal_arm1 = scale * (arm1 + face_slope * shear_arm1)
+    normal_arm2 = scale * (arm2 + face_slope * shear_arm2)
+    shear_arm1 = scale * (shear_arm1 - face_slope * arm1)
+    shear_arm2 = scale * (shear_arm2 - face_slope * arm2)
     remaining1, slope1, curvature1 = _unexplained(
-        data1, d1, theta1, 1.0, rolled[0], torques[0], arm1, moment_arm1
+        data1, d1, theta1, 1.0, rolled[0], torques[0], normal_arm1, shear_arm1
     )
     remaining2, slope2, curvature2 = _unexplained(
-        data2, d2, theta2, -1.0, rolled[1], torques[1], arm2, moment_arm2
+        data2, d2, theta2, -1.0, rolled[1], torques[1], normal_arm2, shear_arm2
     )
     moment_arm = 0.5 * (slope1 + slope2)
     if moment_arm <= 0.0:

@@ -99,8 +99,9 @@ def test_a_tapered_object_satisfies_the_constraints_of_its_faces(taper):
         right = [-rolls[0] * dq[0], -rolls[1] * dq[1], deeper[1] - deeper[0]]
         gx, gy, turned = np.linalg.solve(left, right)
         both = sum(deeper) + (n[1] - n[0]) @ [gx, gy] + (s[0] - s[1]) * turned
-        assert turned == pytest.approx(motion.turn[0] * dq[0] - motion.turn[1] * dq[1], rel=1e-12)
-        found = motion.arm @ np.array(dq) + motion.slide * turned
+        r1, r2 = motion.rolling_ratio
+        assert turned == pytest.approx(r1 * dq[0] - r2 * dq[1], rel=1e-12)
+        found = motion.moment_arm @ np.array(dq) + motion.slide * turned
         assert found == pytest.approx(both, rel=1e-12, abs=1e-15)
     touched = [tips[0] + (a - d[0]) * n[0], tips[1] - (a - d[1]) * n[1]]
     along = np.array([math.cos(angle), math.sin(angle)])
@@ -220,10 +221,11 @@ def test_torques_that_no_load_explains_give_a_finite_load(table):
             assert slope > 0.0
 
 
+@pytest.mark.parametrize("closing", [0.2, 0.34])  # The object is 28 or 7 mm wide.
 @pytest.mark.parametrize("load", [0.0, 3.0])
 @pytest.mark.parametrize("taper", [-0.3, 0.3])
-def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, taper, load):
-    q, d, angle = (0.2, 0.2), (3e-3, 3e-3), 0.0
+def test_load_on_a_tapered_object_excludes_the_normal_forces_along_it(table, taper, load, closing):
+    q, d, angle = (closing, closing), (3e-3, 3e-3), 0.0
     theta = (q[0] - 0.5 * taper, 0.5 * taper - q[1])
     data, lean = table.data, math.tan(0.5 * taper)
     motion = held_motion(q, d, angle, taper, LENGTHS)

@@ -20,7 +20,7 @@ class GripUnderLoad:
     def __init__(self, asked: float = FORCE, **control: float) -> None:
         self.held = held = GraspState()
         held.load_arm = 0.03
-        held.moment_arm, held.jacobian_rotation, held.stiffness = (
+        held.moment_arm, held.rolling_ratio, held.stiffness = (
             [0.079, 0.079],
             [0.75, 0.75],
             [6e3, 6e3],
@@ -284,11 +284,11 @@ def some_held(generator: np.random.Generator, force: float) -> GraspState:
     held.force = [force, force]
     held.q = list(generator.uniform(-0.2, 0.2, 2))
     held.moment_arm = list(generator.uniform(0.06, 0.09, 2))
-    held.jacobian_rotation = list(generator.uniform(0.5, 1.0, 2))
+    held.rolling_ratio = list(generator.uniform(0.5, 1.0, 2))
     held.energy_arm = list(generator.uniform(0.06, 0.09, 2))
     held.stiffness = list(generator.uniform(2e3, 9e3, 2))
     held.normal = list(generator.uniform(5.0, 9.0, 2))
-    held.jacobian_slide = generator.uniform(-0.02, 0.02)
+    held.slide = generator.uniform(-0.02, 0.02)
     held.angle_std = generator.uniform(0.0, 0.02)
     return held
 
@@ -297,7 +297,7 @@ def test_late_frames_keep_the_force_and_let_a_turn_stop():
     generator = np.random.default_rng(6)
     held = some_held(generator, 8.0)
     grip = Grip(Settings(), [0, 1], held)
-    held.jacobian_slide, held.moment_arm = 0.0, [0.08, 0.08]
+    held.slide, held.moment_arm = 0.0, [0.08, 0.08]
     grip.start(8.0, 8.0)
     grip.steer(0.0, 0.3)
     for _ in range(100):

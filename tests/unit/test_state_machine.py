@@ -21,7 +21,7 @@ class Machine:
     def __init__(self) -> None:
         self.state, self.goal, grasp = State(), Goal(), GraspState()
         grasp.moment_arm, grasp.energy_arm = [0.079, 0.079], [0.079, 0.079]
-        grasp.jacobian_rotation, grasp.stiffness = [0.75, 0.75], [6e3, 6e3]
+        grasp.rolling_ratio, grasp.stiffness = [0.75, 0.75], [6e3, 6e3]
         grasp.d, grasp.normal = [4e-3, 4e-3], [FORCE, FORCE]
         self.grasp = grasp
         self.control = Control(Settings(), self.state, grasp)

@@ -82,7 +82,7 @@ class TwoPhased(Altered):
         self.force.step(state.force_rate)
         if pose.valid and not math.isnan(self.target_angle):
             error = self.target_angle - pose.angle
-            rate = 2.0 * math.pi * self._bandwidth * error / sum(grasp.jacobian_rotation)
+            rate = 2.0 * math.pi * self._bandwidth * error / sum(grasp.rolling_ratio)
             state.offset += rate * state.law.dt
         bias = 0.5 * self.force.value * sum(grasp.moment_arm)
         damping = state.law.damping * math.sqrt(state.joint_stiffness)
