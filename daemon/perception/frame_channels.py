@@ -100,6 +100,12 @@ class FingerMotion(NamedTuple):
 
 
 @inner_kernel
+def _sense(finger: int) -> float:
+    """Return ∂θ/∂q of a tip: 1 for the left finger and −1 for the right finger."""
+    return 1.0 - 2.0 * finger
+
+
+@inner_kernel
 def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int) -> FingerMotion:
     """Interpolate the motion history at time ``t``; clamp ``t`` to the ends of the history."""
     size = len(history)
@@ -129,7 +135,7 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
 
 @inner_kernel
 def _rates(
-    h: HandFilter, history: Records[HistoryRow], finger: int, scan: float, sense: float
+    h: HandFilter, history: Records[HistoryRow], finger: int, scan: float
 ) -> tuple[float, float]:
     """Return the rates of d [m/s] and θ [rad/s] at the time ``scan``.
 
@@ -144,7 +150,7 @@ def _rates(
     last = _motion_at(history, h.newest_row, end, finger)
     span = max(end - (scan - span), span_min)
     d_rate = (last.d - first.d) / span
-    theta_rate = (last.angle - first.angle - sense * (last.q - first.q)) / span
+    theta_rate = (last.angle - first.angle + _sense(finger) * (last.q - first.q)) / span
     if abs(d_rate) < h.velocity_unit * h.length:
         d_rate = 0.0
     if abs(theta_rate) < 2.0 * h.velocity_unit:
@@ -153,13 +159,11 @@ def _rates(
 
 
 @inner_kernel
-def _motion_since(
-    h: HandFilter, history: Records[HistoryRow], finger: int, t: float, sense: float
-) -> Scan:
+def _motion_since(h: HandFilter, history: Records[HistoryRow], finger: int, t: float) -> Scan:
     """Return a finger's motion since the sensor scanned the frame with time stamp ``t``."""
     scan = t - h.mean[LATENCY]
     row = _motion_at(history, h.newest_row, scan, finger)
-    d_rate, theta_rate = _rates(h, history, finger, scan, sense)
+    d_rate, theta_rate = _rates(h, history, finger, scan)
     travel = h.tip[finger].travel
     return Scan(
         travel[0] - row.d,
@@ -173,11 +177,11 @@ def _motion_since(
 
 
 @inner_kernel
-def _set_angle_slopes(h: HandFilter, finger: int, sense: float, theta_rate: float) -> None:
+def _set_angle_slopes(h: HandFilter, finger: int, theta_rate: float) -> None:
     h.slopes[ANGLE] = 1.0
-    h.slopes[TAPER] = 0.5 * sense
+    h.slopes[TAPER] = -0.5 * _sense(finger)
     h.slopes[ANGLE_BIAS + finger] = 1.0
-    h.slopes[ENCODER + finger] = -sense
+    h.slopes[ENCODER + finger] = _sense(finger)
     h.slopes[LATENCY] = -theta_rate
 
 
@@ -215,8 +219,8 @@ def update(
         h.grasp.unexplained_rotation[:] = 0.0
     d_noise = covariance[0, 0] - systematic[0, 0]
     theta_noise = covariance[1, 1] - systematic[1, 1]
-    sense = -1.0 if finger == 0 else 1.0
-    scan = _motion_since(h, history, finger, t, sense)
+    sense = _sense(finger)
+    scan = _motion_since(h, history, finger, t)
     is_fitted = covariance[3, 3] > 0.0
     shows_d = is_fitted or h.gain_is_known
     tilt = total_tilt(found.theta, found.tilt_y)
@@ -226,10 +230,10 @@ def update(
     if h.gain_is_known and not is_fitted:  # The amplitude determines d.
         d -= math.log(scan.relaxation) / log_slope
     q = joint_angle(h, finger) - scan.q  # joint angle at the scan [rad]
-    face = found.theta + sense * q  # face angle at the scan [rad]
+    face = found.theta - sense * q  # face angle at the scan [rad]
     is_new_contact = not tip.in_contact
     if is_new_contact:
-        _begin_contact(h, finger, sense, face + scan.rotation)
+        _begin_contact(h, finger, face + scan.rotation)
         reset(h, D + finger, d + scan.d, h.radius * h.radius)
     pending_variance = 0.0
     if shows_d:  # Otherwise, only frames during motion separate d from the gain.
@@ -237,12 +241,12 @@ def update(
         pending_variance = scan.pending * scan.pending * max(h.frame_rate * settling_time(h), 1.0)
     d_noise += pending_variance
     d_at_scan = h.mean[D + finger] - scan.d
-    angle_at_scan = h.mean[ANGLE] + 0.5 * sense * h.mean[TAPER] - scan.rotation
+    angle_at_scan = h.mean[ANGLE] - 0.5 * sense * h.mean[TAPER] - scan.rotation
     angle_innovation = face - (angle_at_scan + h.mean[ANGLE_BIAS + finger])
     d_innovation = d - (d_at_scan + h.mean[D_BIAS + finger])
     if is_held(h) and min(h.grasp.normal[0], h.grasp.normal[1]) > h.contact_force:
         jump = (angle_innovation, d_innovation if is_fitted else 0.0)
-        if _is_rejected(h, finger, sense, scan, jump, (theta_noise, d_noise)):
+        if _is_rejected(h, finger, scan, jump, (theta_noise, d_noise)):
             return False
     tip.tilt_y = found.tilt_y
     tip.gain_is_unknown = not shows_d
@@ -253,7 +257,7 @@ def update(
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = True
-    _update_angle(h, finger, sense, angle_innovation, theta_noise, scan.theta_rate, is_new_contact)
+    _update_angle(h, finger, angle_innovation, theta_noise, scan.theta_rate, is_new_contact)
     tip.in_contact = True
     if tip.gain_is_unknown:
         expected = lookup(table, max(d_at_scan, D_MIN), tilt)
@@ -316,7 +320,7 @@ def _is_finite(h: HandFilter) -> bool:
 
 
 @inner_kernel
-def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> None:
+def _begin_contact(h: HandFilter, finger: int, face: float) -> None:
     """Reset a finger's states on first contact.
 
     ``face`` is the angle of the object face in the first frame [rad]. If the other tip is not in
@@ -331,7 +335,7 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
     if h.tip[1 - finger].in_contact:
         return
     reset_all(h)
-    reset(h, ANGLE, face - 0.5 * sense * h.mean[TAPER], h.prior_variance[ANGLE])
+    reset(h, ANGLE, face + 0.5 * _sense(finger) * h.mean[TAPER], h.prior_variance[ANGLE])
     for k in range(2):
         measured = h.grasp.free_torque[k]
         if measured > 0.0:
@@ -345,7 +349,6 @@ def _begin_contact(h: HandFilter, finger: int, sense: float, face: float) -> Non
 def _update_angle(
     h: HandFilter,
     finger: int,
-    sense: float,
     innovation: float,
     noise: float,
     theta_rate: float,
@@ -356,7 +359,7 @@ def _update_angle(
     An innovation beyond the gate indicates that the object has rotated unexpectedly.
     """
     before = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger]
-    _set_angle_slopes(h, finger, sense, theta_rate)
+    _set_angle_slopes(h, finger, theta_rate)
     if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
         h.covariance[ANGLE, ANGLE] += innovation * innovation
     correct(h, ANGLE_CHANNEL + finger, innovation, noise, math.inf)
@@ -385,9 +388,7 @@ def _update_footprint(h: HandFilter, finger: int, innovation: float, noise: floa
 
 
 @inner_kernel
-def _is_rejected(
-    h: HandFilter, finger: int, sense: float, scan: Scan, jump: FloatPair, noise: FloatPair
-) -> bool:
+def _is_rejected(h: HandFilter, finger: int, scan: Scan, jump: FloatPair, noise: FloatPair) -> bool:
     """Return True if a frame of a held object is an outlier, and count consecutive outliers.
 
     ``jump`` contains the innovations of angle and d, and ``noise`` contains the noise variances.
@@ -400,7 +401,7 @@ def _is_rejected(
     grasp = h.grasp
     tip = h.tip[finger]
     other = 1 - finger
-    _set_angle_slopes(h, finger, sense, scan.theta_rate)
+    _set_angle_slopes(h, finger, scan.theta_rate)
     angle_std = math.sqrt(predicted_variance(h) + noise[0])
     h.slopes[:] = 0.0
     _set_d_slopes(h, finger, 1.0, 1.0, scan.d_rate)

@@ -54,7 +54,8 @@ class GraspState(Record):
     rejects_frames: Pair  # 1 if too many consecutive frames were rejected
     d_bias: Pair  # [m]
     angle_bias: Pair  # [rad]
-    has_bias: Pair  # 1 if the sensor's bias is significant
+    has_d_bias: Pair  # 1 if `d_bias` is significant
+    has_angle_bias: Pair  # 1 if `angle_bias` is significant
     gain_change: Pair  # ln(sensor gain / prior gain)
     gain_std: Pair
     gain_prior_std: Pair

@@ -296,32 +296,23 @@ def _write_consistency(h: HandFilter) -> None:
         grasp.angle_bias[k] = h.mean[ANGLE_BIAS + k]
         grasp.gain_change[k] = h.mean[GAIN + k] - h.prior_mean[GAIN + k]
         grasp.gain_std[k] = math.sqrt(max(h.covariance[GAIN + k, GAIN + k], 0.0))
-        has_bias = _has_bias(h, k)
-        grasp.has_bias[k] = 1.0 if has_bias else 0.0
-        if has_bias or grasp.rejects_frames[k] or grasp.has_wrong_current[k]:
+        has_d_bias = _has_bias(h, D_BIAS, k, _D_BIAS_MIN * grasp.d[k])
+        has_angle_bias = _has_bias(h, ANGLE_BIAS, k, IMAGE_SHIFT_MIN)
+        grasp.has_d_bias[k] = 1.0 if has_d_bias else 0.0
+        grasp.has_angle_bias[k] = 1.0 if has_angle_bias else 0.0
+        if has_d_bias or has_angle_bias or grasp.rejects_frames[k] or grasp.has_wrong_current[k]:
             grasp.sensor_fault = True
 
 
 @inner_kernel
-def _has_bias(h: HandFilter, finger: int) -> bool:
-    """Return True if a sensor's zero offset or image has shifted significantly."""
-    d = h.grasp.d[finger]
-    d_variance = h.covariance[D_BIAS + finger, D_BIAS + finger]
-    angle_variance = h.covariance[ANGLE_BIAS + finger, ANGLE_BIAS + finger]
-    if not (d_variance > 0.0 and d > 0.0):
-        return False
-    d_min = max(_D_BIAS_MIN * d, OUTLIER_GATE * math.sqrt(d_variance))
-    angle_min = max(IMAGE_SHIFT_MIN, OUTLIER_GATE * math.sqrt(max(angle_variance, 0.0)))
-    in_d = _is_larger_bias(h, D_BIAS, finger, d_min)
-    return in_d or _is_larger_bias(h, ANGLE_BIAS, finger, angle_min)
+def _has_bias(h: HandFilter, pair: int, finger: int, smallest: float) -> bool:
+    """Return True if a sensor's bias is significant and exceeds ``smallest``.
 
-
-@inner_kernel
-def _is_larger_bias(h: HandFilter, pair: int, finger: int, smallest: float) -> bool:
-    """Return True if a sensor's bias exceeds both ``smallest`` and the other sensor's bias.
-
-    A bias in one sensor also causes a smaller apparent bias in the other sensor.
+    A bias in one sensor also causes a smaller apparent bias in the other sensor. Only the sensor
+    with the larger bias has a significant bias.
     """
     size = abs(h.mean[pair + finger])
-    is_larger: bool = size > smallest and size >= abs(h.mean[pair + 1 - finger])
-    return is_larger
+    std = math.sqrt(max(h.covariance[pair + finger, pair + finger], 0.0))
+    is_larger = size >= abs(h.mean[pair + 1 - finger])
+    is_significant: bool = is_larger and size > max(smallest, OUTLIER_GATE * std)
+    return is_significant and h.grasp.d[finger] > 0.0

@@ -22,7 +22,6 @@ from typing import Literal
 import numpy as np
 
 from softfinger.daemon.control.modes import GRIPPING_MODES, HOLDING_MODES, Mode
-from softfinger.daemon.perception.frame_channels import IMAGE_SHIFT_MIN
 from softfinger.daemon.perception.grasp import GraspState
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -639,13 +638,14 @@ def _sensor_fault(view: View, state: State, finger: int) -> str:
             "and the other tip: the sensor has shifted, its frames are old, or the tip is at the "
             "object's edge"
         )
-    if found.has_bias[finger] and view.holds(state):
-        off, turned = 1e3 * found.d_bias[finger], math.degrees(found.angle_bias[finger])
-        if abs(found.angle_bias[finger]) > IMAGE_SHIFT_MIN:
-            return (
-                f"the angle measured by the {side} sensor differs by {turned:+.0f}° from the "
-                "rolling angle computed from the joints: the sensor's image has shifted"
-            )
+    if found.has_angle_bias[finger] and view.holds(state):
+        return (
+            f"the angle measured by the {side} sensor differs by "
+            f"{math.degrees(found.angle_bias[finger]):+.0f}° from the rolling angle computed from "
+            "the joints: the sensor's image has shifted"
+        )
+    if found.has_d_bias[finger] and view.holds(state):
+        off = 1e3 * found.d_bias[finger]
         return (
             f"the displacement measured by the {side} sensor is {abs(off):.1f} mm "
             f"{'less' if off < 0.0 else 'more'} than the value computed from the joint's angle and "

@@ -681,7 +681,7 @@ class Soak:
             side, finger = FINGERS[sensor.finger], sensor.finger
             if (
                 found.rejects_frames[finger]
-                or (held and found.has_bias[finger])
+                or (held and (found.has_d_bias[finger] or found.has_angle_bias[finger]))
                 or sensor.repeats.is_fault
             ):
                 yield f"{side}_sensor"
