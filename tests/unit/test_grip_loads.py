@@ -86,6 +86,18 @@ def test_torque_that_the_friction_of_stationary_joints_balances_is_not_a_load():
         assert watched.grip.slip.load == 0.0
 
 
+@pytest.mark.parametrize("error", [0.5, -0.5])
+def test_a_lasting_force_error_does_not_wind_up_the_integral(error):
+    """A joint that sticks keeps the force wrong for seconds; then the force recovers at once."""
+    watched = GripUnderLoad()
+    watched.held.force = [FORCE * (1.0 - error)] * 2
+    watched.run(0.0, 2500, holding=False)
+    assert (watched.grip._state.grip_force - FORCE) * error > 0.0
+    watched.held.force = [FORCE * (1.0 + 0.5 * error)] * 2
+    watched.run(0.0, 250, holding=False)
+    assert (watched.grip._state.grip_force - FORCE) * error < 0.0
+
+
 GIVES_WAY = -0.024  # one velocity count [rad/s]
 
 
