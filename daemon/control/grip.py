@@ -133,6 +133,7 @@ class Grip:
         self._state.dither_elapsed = 0.0
         needed_force = min(self.slip.needed_force, self.slip.force_limit)
         self.force.target = max(force, needed_force)
+        # Force increases against slip use the same rate, so a small change must not slow them down.
         change_min = max(0.1 * force, 0.5 * self._control.grip_raise_max)
         change = max(abs(force - self.force.value), change_min)
         self._state.force_rate = change / self._control.force_time

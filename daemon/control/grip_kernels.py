@@ -23,7 +23,8 @@ from softfinger.kinematics.hand.upright import upright_spring
 
 FloatArray = NDArray[np.float64]
 
-_TORQUE_ERROR_SIGMA = 2.0  # force margin, in standard deviations of the torque constant
+# Force margin, in standard deviations of the torque constant; covers 95 % of all servos.
+_TORQUE_ERROR_SIGMA = 2.0
 _DISTRIBUTE_BANDWIDTH = 2.0  # bandwidth of the controller that equalises the tip forces [Hz]
 # Tolerance of the object angle [rad]. The noise of simulated sensors is 0.5 to 2 mrad (1 σ).
 ANGLE_TOLERANCE = math.radians(0.5)

@@ -227,7 +227,7 @@ def update(
     shown = lookup(table, found.d, tilt)
     log_slope = shown.force_d / shown.force
     d, gain = found.d, found.gain / scan.relaxation
-    if h.gain_is_known and not is_fitted:  # The amplitude determines d.
+    if h.gain_is_known:  # The amplitude determines d.
         d -= math.log(scan.relaxation) / log_slope
     q = joint_angle(h, finger) - scan.q  # joint angle at the scan [rad]
     face = found.theta - sense * q  # face angle at the scan [rad]
@@ -271,7 +271,7 @@ def update(
     else:
         _set_d_slopes(h, finger, 1.0, 1.0, scan.d_rate)
         _update_footprint(h, finger, d_innovation, d_noise)
-    if is_fitted and not h.gain_is_known and gain > 0.0:
+    if is_fitted and gain > 0.0:
         both_noise = covariance[0, 3] - systematic[0, 3]
         gain_noise = covariance[3, 3] - systematic[3, 3]
         noise = d_noise, both_noise, gain_noise

@@ -59,7 +59,8 @@ from softfinger.kinematics.hand.grasp_state import (
 
 FloatArray = NDArray[np.float64]
 
-_SUPPORT_FRICTION = 0.4  # friction force between object and table [N]
+# Friction force between object and table [N], for example of 0.1 kg with a coefficient of 0.4.
+_SUPPORT_FRICTION = 0.4
 _D_BIAS_MIN = 0.1  # fraction of d
 _PAUSE_MAX = 0.3  # total time without closing after which the first force ramp has ended [s]
 
