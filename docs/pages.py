@@ -2,7 +2,9 @@
 
 MkDocs calls the ``on_…`` functions (``hooks`` in mkdocs.yml). `PAGES` contains complete pages, and
 `TABLES` contains tables within pages. All numbers that the code can compute are generated here.
-``python docs/pages.py`` draws docs/pictures/hand.svg, the moving picture of the first page.
+``python docs/pages.py`` writes the tables into the pages in docs/, so that they can also be read
+without building the site. ``python docs/pages.py picture`` draws docs/pictures/hand.svg, the moving
+picture of the first page.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import json
 import math
 import os
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
@@ -609,6 +612,24 @@ _LINKS = {
 }
 
 
+# A table in a page, from its mark to its end. Tables without an end are inserted only into the
+# site, because they are too long for the page's source.
+_TABLE = re.compile(
+    r"(?P<mark><!-- table: (?P<name>\w+) -->)(?P<stored>\n(?:(?!<!--).)*<!-- end -->)?", re.S
+)
+
+
+def with_tables(markdown: str) -> str:
+    """Return a page's source in which all stored tables are up to date."""
+
+    def table(found: re.Match[str]) -> str:
+        if not found["stored"]:
+            return found[0]
+        return f"{found['mark']}\n\n{TABLES[found['name']]()}\n<!-- end -->"
+
+    return _TABLE.sub(table, markdown)
+
+
 def on_config(config: Any) -> Any:
     """Show version and licence in the footer of each page."""
     from softfinger import __version__
@@ -631,9 +652,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Insert generated tables, and replace links to repository files with links to pages."""
-    markdown = re.sub(
-        r"\s*<!-- table: (\w+) -->", lambda found: f"\n\n{TABLES[found[1]]()}", markdown
-    )
+    markdown = _TABLE.sub(lambda found: f"\n\n{TABLES[found['name']]()}", markdown)
 
     def link(found: re.Match[str]) -> str:
         target = found[1].removeprefix("../").removeprefix("docs/")
@@ -681,4 +700,8 @@ def _drawing(found: re.Match[str]) -> str:
 
 
 if __name__ == "__main__":
-    save_grasp(ROOT / "docs" / "pictures" / "hand.svg")
+    if sys.argv[1:] == ["picture"]:
+        save_grasp(ROOT / "docs" / "pictures" / "hand.svg")
+    else:
+        for page in ROOT.glob("docs/*.md"):
+            page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

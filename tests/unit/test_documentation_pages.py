@@ -55,6 +55,12 @@ def test_every_page_is_built(site):
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
+def test_stored_tables_are_up_to_date(site, source):
+    text = source.read_text(encoding="utf-8")
+    assert site[0].with_tables(text) == text, "run `python docs/pages.py`"
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
 def test_links_in_the_repository_are_valid(source):
     for target, anchor in LINK.findall(written(source.read_text(encoding="utf-8"))):
         path = (source.parent / target).resolve() if target else source
