@@ -142,7 +142,7 @@ def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any,
         dest="subcommand", metavar="SUBCOMMAND", required=True, parser_class=Parser
     )
     made = {}
-    for name, (room, text) in SUBCOMMANDS.items():
+    for name, (package, text) in SUBCOMMANDS.items():
         subparser = subparsers.add_parser(
             name,
             help=text,
@@ -150,7 +150,7 @@ def make_parser(imported: Collection[str]) -> tuple[Parser, dict[str, tuple[Any,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if name in imported:
-            module = importlib.import_module(f"softfinger.tools.{room}.{name.replace('-', '_')}")
+            module = importlib.import_module(f"softfinger.tools.{package}.{name.replace('-', '_')}")
             module.add_arguments(subparser)
             made[name] = module, subparser
     return parser, made

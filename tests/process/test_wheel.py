@@ -101,8 +101,8 @@ def test_a_clone_without_symlinks_is_not_built(found, tmp_path):
 def test_the_wheel_contains_one_package_with_all_its_data(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name.split("/")[0].split("-")[0] for name in names} == {"softfinger"}
-    for rooms in ("daemon", "kinematics", "tools"):
-        for module in (ROOT / rooms).rglob("*.py"):
+    for package in ("daemon", "kinematics", "tools"):
+        for module in (ROOT / package).rglob("*.py"):
             assert f"softfinger/{module.relative_to(ROOT)}" in names
     for profile in (ROOT / "config").glob("*.toml"):
         assert f"softfinger/config/{profile.name}" in names

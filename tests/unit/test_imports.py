@@ -67,7 +67,7 @@ def circle(graph: Mapping[str, set[str]]) -> list[str]:
     return []
 
 
-def rooms(top: str) -> dict[str, set[str]]:
+def packages(top: str) -> dict[str, set[str]]:
     """Return the imports between the subpackages of ``top``.
 
     A module directly in ``top`` counts as a subpackage.
@@ -75,14 +75,14 @@ def rooms(top: str) -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {}
     for name, others in imports().items():
         if name.startswith(f"{top}."):
-            room = graph.setdefault(name.split(".")[1], set())
-            room |= {each.split(".")[1] for each in others if each.startswith(f"{top}.")}
-    return {room: others - {room} for room, others in graph.items()}
+            package = graph.setdefault(name.split(".")[1], set())
+            package |= {each.split(".")[1] for each in others if each.startswith(f"{top}.")}
+    return {package: others - {package} for package, others in graph.items()}
 
 
 def table_of_rooms() -> list[str]:
-    """Return the rows of the table of rooms on the architecture page."""
-    _, _, after = PAGE.read_text(encoding="utf-8").partition("| room |")
+    """Return the rows of the table of packages on the architecture page."""
+    _, _, after = PAGE.read_text(encoding="utf-8").partition("| package |")
     return [line for line in after.partition("\n\n")[0].splitlines() if line.startswith("| `")]
 
 
@@ -106,23 +106,23 @@ def test_modules_have_no_import_cycles():
 
 def test_rooms_have_no_import_cycles():
     for top in ORDER:
-        assert circle(rooms(top)) == [], top
+        assert circle(packages(top)) == [], top
 
 
 def test_daemon_rooms_import_downwards_in_the_architecture_table():
     rows = (re.findall(r"`daemon/(\w+)", line.split("|")[1]) for line in table_of_rooms())
-    place = {room: row for row, names in enumerate(rows) for room in names}
-    graph = rooms("daemon")
+    place = {package: row for row, names in enumerate(rows) for package in names}
+    graph = packages("daemon")
     assert place.keys() == graph.keys()
-    for room, others in graph.items():
-        wrong = sorted(each for each in others if place[each] <= place[room])
+    for package, others in graph.items():
+        wrong = sorted(each for each in others if place[each] <= place[package])
         assert not wrong, (
-            f"daemon/{room} imports {', '.join(wrong)}, but may import only lower packages"
+            f"daemon/{package} imports {', '.join(wrong)}, but may import only lower packages"
         )
 
 
 def test_clients_and_gateway_import_neither_loop_nor_profile():
-    graph = rooms("daemon")
+    graph = packages("daemon")
     assert not {"loop", "profile"} & (graph["client"] | graph["gateway"])
 
 
