@@ -110,7 +110,7 @@ class CommandEndpoint:
     def fence(self, stops: int) -> None:
         """Stamp requests as older than the last stop until all earlier requests are read.
 
-        Meanwhile, replies are delayed by at most `bounds.ANSWER_DELAY_MAX`.
+        Meanwhile, replies are delayed by at most `bounds.ANSWER_DELAY_MAX`, unless the loop ends.
         """
         if not self._is_fenced:  # After a restart, this is the stop count of the last gateway.
             self._is_fenced, self.stops, self._fence = True, stops, stops
@@ -152,7 +152,8 @@ class CommandEndpoint:
             self.count -= 1
             if client.waiting:
                 self._turns.append(client)
-        if self.stops == self._fence or self._held_for > bounds.ANSWER_DELAY_MAX:
+        is_held = self.stops != self._fence and self._held_for <= bounds.ANSWER_DELAY_MAX
+        if not is_held or self._channel.over:
             while self._replies:
                 self._send(self._replies.popleft())
 

@@ -204,6 +204,17 @@ def test_a_stop_is_urgent_in_each_format_of_short_strings(served, context, addre
     client.socket.close(0)
 
 
+def test_delayed_replies_are_sent_when_the_daemon_ends(served, context, addresses):
+    client = Asking(context, served, addresses[1], "stop")
+    until(lambda: served.serve(echo) or served.link.stops)
+    served.settle()
+    assert not client.socket.poll(0), "the reply to a stop is delayed"
+    served.link.close()
+    served.service.step(0.0)
+    assert client.socket.poll(30_000)
+    assert msgpack.unpackb(client.socket.recv())["ok"]
+
+
 def test_kept_messages_are_repeated_if_the_gateway_did_not_read():
     link, (ours, theirs) = Link(), pair()
     link.offer(Channel(ours))
