@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import secrets
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from softfinger.daemon.client.connection import (
     OneThread,
     both_addresses,
     is_host,
+    milliseconds,
     require_address,
     still_waiting,
 )
@@ -115,10 +115,10 @@ def send_once(address: str, attempts: Attempts, keys: ClientKeys | None = None) 
             raise NoAnswer(f"{address}: {error}") from None
         socket.send(msgpack.packb(request))
         silence = min(SILENCE_TIME, remaining)
-        answered = socket.poll(math.ceil(silence * 1e3))
+        answered = socket.poll(milliseconds(silence))
         if not answered and silence < remaining:
             _log.warning(still_waiting(answer, timeout))
-            answered = socket.poll(math.ceil((remaining - silence) * 1e3))
+            answered = socket.poll(milliseconds(remaining - silence))
         if not answered:
             hint = " (if access.keys is set, pass --keys or keys=)" if keys is None else ""
             raise NoAnswer(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import threading
@@ -18,6 +19,7 @@ from softfinger.daemon.types import COMMAND_ADDRESS, STREAM_ADDRESS
 REPLY_TIMEOUT = 5.0  # default timeout for a reply or the first message [s]
 SILENCE_TIME = 1.0  # time without a message before a warning is logged [s]
 
+_WAIT_MAX = 1e6  # longest single wait [s]; ZeroMQ accepts less than 2³¹ ms
 _QUEUE_LENGTH = 100_000  # maximum number of messages queued for a slow program
 # Maximum message size [bytes]. A tactile frame with the largest grid is 131 kB.
 _MESSAGE_SIZE_MAX = 4_000_000
@@ -151,6 +153,15 @@ def unpack(frames: list[bytes]) -> tuple[bytes, dict[str, Any]]:
     if not isinstance(message, dict):
         raise ValueError("not a map")
     return topic, message
+
+
+def milliseconds(seconds: float) -> int:
+    """Convert a waiting time to the argument of `zmq.Socket.poll`.
+
+    A negative time becomes 0, because ZeroMQ would wait forever. A time of more than 10⁶ s is
+    shortened.
+    """
+    return math.ceil(1e3 * min(max(seconds, 0.0), _WAIT_MAX))
 
 
 def still_waiting(what: str, timeout: float) -> str:

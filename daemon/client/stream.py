@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.client.connection import (
     SILENCE_TIME,
     OneThread,
+    milliseconds,
     still_waiting,
     subscribe,
     unpack,
@@ -210,7 +211,7 @@ class Subscriber(Generic[_Record]):
         end, warn_at = now + timeout, now + SILENCE_TIME
         while True:
             self._require_open()
-            yield math.ceil(1e3 * (min(end, max(warn_at, now)) - now))
+            yield milliseconds(min(end, max(warn_at, now)) - now)
             now = time.monotonic()
             if now >= end:
                 return

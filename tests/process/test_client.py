@@ -144,6 +144,26 @@ def test_waiting_for_a_daemon_names_the_awaited_data(addresses, caplog, monkeypa
     assert caplog.messages == said + said
 
 
+def test_a_negative_timeout_has_expired(addresses):
+    with Hand(*addresses) as hand, pytest.raises(NoStream):
+        hand.state(timeout=-1.0)
+
+    async def ask() -> None:
+        async with AsyncHand(*addresses) as hand:
+            with pytest.raises(NoStream):
+                await asyncio.wait_for(hand.state(timeout=-1.0), 60.0)
+
+    asyncio.run(ask())
+
+
+def test_an_infinite_timeout_waits_for_the_first_message(fake, monkeypatch):
+    for module in (command_client, stream_module):
+        monkeypatch.setattr(module, "SILENCE_TIME", 0.0)
+    with Hand(fake.state_address, fake.command_address, timeout=math.inf) as hand:
+        assert hand.state().mode == "holding"
+        hand.arm()
+
+
 def test_the_displayed_waiting_time_is_rounded():
     assert still_waiting("state", 9.99947).endswith("waiting up to 10 s")
     assert still_waiting("state", 86400.0).endswith("waiting up to 86400 s")
