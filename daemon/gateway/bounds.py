@@ -23,7 +23,9 @@ POLL_GAP_MAX = 0.05
 # Connections
 HANDSHAKE_TIMEOUT = 2.0  # s
 SOCKET_QUEUE_LENGTH = 64  # maximum number of messages in each libzmq queue of a client
-PART_SIZE_RATIO = 4  # size limit of one message part, as a multiple of commands.max_bytes
+# Size limit of one part of a request, as a multiple of commands.max_bytes. The limit is at least
+# SUBSCRIPTION_SIZE_MAX, because libzmq also applies it to the handshake.
+PART_SIZE_RATIO = 4
 PART_COUNT_MAX = 16  # maximum number of parts in a request, including routing frame and envelope
 ENVELOPE_SIZE_MAX = 1024  # maximum combined size of routing frame and envelope [bytes]
 HANDSHAKES_PER_TURN = 64  # maximum number of handshakes in a step

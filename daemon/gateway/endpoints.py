@@ -47,11 +47,13 @@ class ClientSockets:
         Raises AddressError, whose message contains ``setting``.
         """
         config, is_router = self._config, kind == zmq.ROUTER
-        part_size = bounds.PART_SIZE_RATIO * config.max_bytes
+        part_size = bounds.SUBSCRIPTION_SIZE_MAX
+        if is_router:
+            part_size = max(part_size, bounds.PART_SIZE_RATIO * config.max_bytes)
         opened: zmq.Socket[Any] = self._context.socket(kind)
         # Set the options before binding, because an option affects only later connections.
         for option, value in (
-            (zmq.MAXMSGSIZE, part_size if is_router else bounds.SUBSCRIPTION_SIZE_MAX),
+            (zmq.MAXMSGSIZE, part_size),
             (zmq.SNDHWM, bounds.SOCKET_QUEUE_LENGTH if is_router else config.queue),
             (zmq.RCVHWM, bounds.SOCKET_QUEUE_LENGTH),
             (zmq.HANDSHAKE_IVL, int(1e3 * bounds.HANDSHAKE_TIMEOUT)),

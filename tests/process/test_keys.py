@@ -213,6 +213,13 @@ def test_the_key_identifies_a_client_and_clients_without_a_key_get_nothing(
     assert guarded.heard == [{"command": "arm", "client": "alice"}]
 
 
+def test_a_small_command_size_limit_does_not_prevent_the_handshake(addresses, folder, others):
+    with Served(*addresses, keys=str(folder), max_bytes=64) as served:
+        _, commander = ask(others, addresses, load_client(folder))
+        served.serve_until(lambda *_: {}, lambda: commander.poll(0))
+        assert msgpack.unpackb(commander.recv())["ok"]
+
+
 def test_a_stop_is_answered_while_others_stop_continuously(guarded, others, addresses, folder):
     stopper = others.socket(zmq.REQ)
     load_client(folder / "alice").guard(stopper)

@@ -59,8 +59,8 @@ def test_few_requests_are_passed_to_the_loop_at_a_time_and_all_are_answered(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        # a frame that is longer than four requests
-        (zmq.DEALER, b"x" * (bounds.PART_SIZE_RATIO * 200 + 1)),
+        # a frame that is longer than four requests and than any handshake message
+        (zmq.DEALER, b"x" * (bounds.SUBSCRIPTION_SIZE_MAX + 1)),
         # a subscription that is longer than any topic
         (zmq.XSUB, b"\x01" + b"x" * bounds.SUBSCRIPTION_SIZE_MAX),
     ],
