@@ -65,7 +65,8 @@ class ServerKeys:
         clients = self.folder / "clients"
         with _reported(clients):
             check_above(clients / "any")
-        gone = {name for name in self.clients.values() if not (clients / f"{name}.key").exists()}
+            known = self.clients.values()
+            gone = {name for name in known if not (clients / f"{name}.key").exists()}
         found = self
         with contextlib.suppress(_NoDescriptor):
             found = load_server(self.folder)
@@ -170,7 +171,8 @@ def load_server(folder: Path) -> ServerKeys:
     clients = place / "clients"
     with _reported(clients):
         check_above(clients / "any")
-        names = {_keys(path)[0]: path.stem for path in sorted(clients.glob("*.key"))}
+        paths = [path for path in sorted(clients.iterdir()) if path.suffix == ".key"]
+        names = {_keys(path)[0]: path.stem for path in paths}
     if not names:
         raise KeyFileError(
             f"{clients}: the folder does not contain client keys; create keys with "
@@ -199,8 +201,9 @@ def _reported(path: Path) -> Iterator[None]:
         if error.errno is None:  # raised by `check_above`
             raise KeyFileError(str(error)) from None
         kind = _NoDescriptor if error.errno in (errno.EMFILE, errno.ENFILE) else KeyFileError
-        text = f"{path}: can't be read: {error.strerror}; create key files with `softfinger keys`"
-        raise kind(text) from None
+        missing = isinstance(error, FileNotFoundError)
+        remedy = "create key files with `softfinger keys`" if missing else "make it readable"
+        raise kind(f"{path}: can't be read: {error.strerror}; {remedy}") from None
 
 
 def _pair(path: Path) -> tuple[bytes, bytes]:

@@ -91,6 +91,22 @@ def test_damaged_missing_and_readable_key_files_are_reported(folder):
         load_server(folder)
 
 
+def test_an_unreadable_folder_of_client_keys_is_reported(folder, monkeypatch):
+    keys, clients = load_server(folder), folder / "server" / "clients"
+
+    def denied(path: Path) -> NoReturn:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(Path, "exists", denied)
+    with pytest.raises(KeyFileError, match=r"clients: can't be read: Permission denied; make it"):
+        keys.updated()
+    monkeypatch.undo()
+    clients.rename(folder / "moved")
+    clients.touch(0o600)
+    with pytest.raises(KeyFileError, match="clients: can't be read: Not a directory"):
+        load_server(folder)
+
+
 @pytest.mark.parametrize(
     "which",
     ["", "server", "server/clients", "server/clients/alice.key", "server/server.key_secret"],
