@@ -7,9 +7,10 @@ request except ``status``. A ``hold`` replaces a queued ``hold`` that directly p
 same connection.
 
 A client may add a unique ``key`` to a request. If the request is refused as late, the client may
-repeat it. The daemon executes a command with a key at most once. To protect newer commands, the
-daemon refuses a repetition if it has executed another command in the meantime. The commands in
-`NO_LEASE_COMMANDS` can only make the hand safer and are executed every time.
+repeat it. The daemon executes a command with a key at most once, as long as it is one of the last
+`_OUTCOME_COUNT_MAX` commands with a key. To protect newer commands, the daemon refuses a repetition
+if it has executed another command in the meantime. The commands in `NO_LEASE_COMMANDS` can only
+make the hand safer and are executed every time.
 """
 
 from __future__ import annotations

@@ -502,7 +502,10 @@ _command = FieldSource[CommandSource]()
 
 
 @topic(
-    COMMAND, "Every command that received a reply, from any client, except `status`.", CommandSource
+    COMMAND,
+    "Commands from any client or task that were carried out or rejected, except `status`, and "
+    "except malformed maps and commands rejected as `busy`, `stopped` or `superseded`.",
+    CommandSource,
 )
 class AnsweredCommand(_Announcement):
     """One ``hand/command`` message."""

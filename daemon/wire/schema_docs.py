@@ -82,9 +82,11 @@ its grip are rejected if they are older than 0.2 s or `servos.watchdog`, whichev
 **Repeated commands.** To make a late command safe to repeat, add a `key` to the command: a
 unique string of 1 to 64 characters, for example a random number. To repeat the command, send the
 same map again. The daemon carries out the command at most once, and sends the reply of the executed
-command again for each further repetition. If the hand was stopped after the first rejection, the
-repetition is rejected as `stopped`. If another command was carried out after the first rejection,
-the repetition is rejected as `superseded`. `disarm` needs no key, because repeating it is harmless.
+command again for each further repetition. The daemon remembers only the last 256 commands with a
+key, of all clients together. It treats the repetition of an older command as a new command. If the
+hand was stopped after the first rejection, the repetition is rejected as `stopped`. If another
+command was carried out after the first rejection, the repetition is rejected as `superseded`.
+`disarm` needs no key, because repeating it is harmless.
 `Hand`, `AsyncHand`, `softfinger send`, `monitor` and `view` repeat late commands automatically.
 """
 
