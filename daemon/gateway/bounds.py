@@ -48,7 +48,8 @@ CLIENT_QUEUE_LENGTH = 64  # maximum number of queued requests per client
 TOTAL_QUEUE_LENGTH = 2048  # maximum number of queued requests, all clients combined
 TOTAL_RATE = 2000.0  # maximum number of requests per second, all clients combined
 CLIENT_RATE_MIN = 2.0  # guaranteed number of requests per second for each client
-RECOVERY_TIME = 0.05  # pause after which a flooding client's requests are accepted again [s]
+# A flooding client's requests are accepted again once it may send the requests of this time [s].
+RECOVERY_TIME = 0.05
 # Time after a restart of the gateway in which clients may deliver requests that they have queued in
 # the meantime [s]. libzmq reconnects after 0.1 s.
 RECONNECT_TIME = 1.0

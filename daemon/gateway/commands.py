@@ -3,7 +3,7 @@
 The gateway does not unpack requests. Requests that look like a stop are urgent and bypass the
 queues. A client may have only one urgent request at a time. Other requests are forwarded to the
 loop a few at a time. Further requests wait in queues, and the clients are served in turn. If a
-client exceeds its rate limit, its requests are refused until the client pauses.
+client exceeds its rate limit, its requests are refused until its rate has dropped.
 
 Each request is stamped with its arrival time and the number of preceding stops. The libzmq thread
 reads ahead, so the gateway can't determine whether a request arrived before or after a stop. After
@@ -49,17 +49,16 @@ class Client:
     def __init__(self) -> None:
         self.waiting: deque[Ask] = deque()
         self.urgent = False  # True while an urgent request awaits its reply
-        self._behind = False  # True if the client exceeded its rate and has not paused since
+        self._floods = False  # True from a request above the rate limit until the rate has dropped
         self._tokens = math.inf
         self.last = -math.inf  # time of the last request
 
     def floods(self, per_second: float, now: float) -> bool:
-        """Count one request; return True if the rate limit requires the client to pause."""
-        passed, self.last = now - self.last, now
-        tokens = min(self._tokens + passed * per_second, per_second) - 1.0
-        self._tokens = max(tokens, 0.0)
-        self._behind = tokens < 0.0 or (self._behind and passed < bounds.RECOVERY_TIME)
-        return self._behind
+        """Count one request; return True if the client must send fewer requests."""
+        tokens = min(self._tokens + (now - self.last) * per_second, per_second)
+        self._floods = tokens < max(1.0, self._floods * bounds.RECOVERY_TIME * per_second)
+        self._tokens, self.last = max(tokens - 1.0, 0.0), now
+        return self._floods
 
 
 class CommandEndpoint:

@@ -165,6 +165,28 @@ def test_many_connections_do_not_limit_a_client_while_the_total_rate_is_low(addr
             client.send("hold")
 
 
+def test_a_client_below_its_rate_is_heard_again_after_a_burst(addresses, context, clock):
+    """A setpoint stream is delivered in a burst after a pause of the network."""
+    with Served(commands=addresses[1], per_second=100.0, clock=clock) as served:
+        client, replies = connect(context, zmq.DEALER, addresses[1]), list[bool]()
+
+        def stream(count: int, rate: float) -> list[bool]:
+            """Send setpoints, and return whether each of them was accepted."""
+            replies.clear()
+            for k in range(count):
+                client.send(msgpack.packb({"command": "hold", "force": float(k)}))
+                until(served.has_request)
+                clock.sleep_until(clock.now() + 1.0 / rate)
+                served.serve_until(echo, lambda: client.poll(0))
+                replies.append(msgpack.unpackb(client.recv())["ok"])
+            return list(replies)
+
+        assert all(stream(10, 50.0))
+        assert not all(stream(120, 2000.0))
+        assert all(stream(20, 50.0)[-10:])
+        assert not any(stream(50, 200.0)[-10:]), "the limit still holds"
+
+
 @pytest.mark.parametrize("stops", [0, 1])
 def test_requests_that_waited_for_a_restart_of_the_gateway_are_old(
     addresses, context, clock, stops
