@@ -79,3 +79,4 @@ class Config(NamedTuple):
     stream_setting: str = "stream.address"  # setting name in errors about the stream address
     latest: str = ""  # address on which the first topic is published in single-frame messages
     restarted: bool = False  # True if an earlier gateway process has exited
+    stops: int = 0  # stop count that the earlier gateway process confirmed

@@ -80,15 +80,14 @@ class CommandEndpoint:
         self._channel = channel
         self._clock = clock
         self.refused = 0  # number of requests that were refused because of rate or queue limits
-        self.stops = 0  # stop count stamped on new requests
-        self._fence = 0  # current stop count
+        self.stops = config.stops  # stop count stamped on new requests
+        self._fence = config.stops  # current stop count
         self._last_poll = clock()
         # Time of the last poll before a gap between polls. The time is infinite once all requests
         # from the gap have been read.
         self._dated = math.inf
         self._unread_max = 0  # upper bound on the number of unread requests from the gap
         self._since = 0.0  # time of the last stop, gap or check for older requests
-        self._is_fenced = False  # True once the loop has sent a stop count
         if config.restarted:
             self._since = self._last_poll + bounds.RECONNECT_TIME
             self._date(self._last_poll - 2.0 * bounds.RECONNECT_TIME)
@@ -111,8 +110,6 @@ class CommandEndpoint:
 
         Meanwhile, replies are delayed by at most `bounds.ANSWER_DELAY_MAX`, unless the loop ends.
         """
-        if not self._is_fenced:  # After a restart, this is the stop count of the last gateway.
-            self._is_fenced, self.stops, self._fence = True, stops, stops
         if self.stops == self._fence:
             self._held_for = 0.0
         self._fence = stops

@@ -76,7 +76,9 @@ class Gateway:
         self._wait()
         while not self._closing.wait(max(start_at - time.monotonic(), _RESTART_DELAY)):
             start_at = time.monotonic() + _START_INTERVAL
-            self._config = self._config._replace(restarted=True)
+            # Requests that clients have queued since are older than the stops after this count.
+            stops = self.link.confirmed
+            self._config = self._config._replace(restarted=True, stops=stops)
             try:
                 self._start()
                 if self._closing.is_set():  # `close` has closed only the previous channel.

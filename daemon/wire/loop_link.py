@@ -125,14 +125,16 @@ class Channel:
 
 
 class Link:
-    """The loop's end of the socket pair. Other threads may call only `offer`."""
+    """The loop's end of the socket pair.
+
+    Other threads may only call `offer`, append to `notices` and read `confirmed`.
+    """
 
     def __init__(self) -> None:
         self.wanted = 0  # bit mask of topics with subscribers
         self.refused = 0  # number of requests refused by the gateway's rate and queue limits
         self.stops = 0  # number of stops so far
-        self.confirmed = 0  # stop count with which the gateway stamps new requests
-        self._confirmed_before = 0  # the same count of the last gateway that has exited
+        self.confirmed = 0  # stop count with which the gateway, or the last one, stamps requests
         self.asked: deque[Ask] = deque()  # received requests, with urgent requests first
         self.unpacked: deque[tuple[Ask, dict[str, Any]]] = deque()  # queued for a later tick
         self.notices: deque[str] = deque(maxlen=_NOTICE_COUNT_MAX)  # gateway warnings
@@ -154,9 +156,6 @@ class Link:
             self._channel, self._offered = self._offered, None
             self._dropped.update(self._kept)
             self._repeat()
-            # Requests that clients have queued since the last gateway exited are older than the
-            # stops in the meantime.
-            self._channel.send(FENCE, self._confirmed_before)
             self._channel.send(FENCE, self.stops)
         channel = self._channel
         if channel.over:
@@ -202,7 +201,6 @@ class Link:
     def close(self) -> None:
         """Disconnect. The gateway then sends its queued messages and exits."""
         self._channel.close()
-        self._confirmed_before = max(self._confirmed_before, self.confirmed)
-        self.wanted = self.confirmed = 0
+        self.wanted = 0
         self.asked.clear()
         self.unpacked.clear()

@@ -42,6 +42,7 @@ class Served:
             *(stream, commands, GATEWAY_TOPICS, queue, max_bytes, per_second, ipc_mode, keys),
             latest=latest,
             restarted=restarted,
+            stops=self.link.confirmed,
         )
         try:
             now = loop_link.machine_time if clock is None else clock.now

@@ -218,6 +218,27 @@ def test_requests_that_waited_for_a_restart_of_the_gateway_are_old(
         assert ages[-1] < 1.0
 
 
+def test_requests_that_arrive_before_a_new_gateway_meets_the_loop_are_not_stopped(
+    addresses, context, clock, monkeypatch
+):
+    link = Link()
+    with Served(*addresses, clock=clock, link=link) as served:
+        link.fence()
+        until(served._is_open)
+    link.look()
+    with monkeypatch.context() as patch:
+        patch.setattr(Served, "settle", lambda _: None)
+        served = Served(*addresses, clock=clock, link=link, restarted=True)
+    with served:
+        client = Asking(context, served, addresses[1], "arm")
+        until(served.has_request)
+        served.service.step(0.0)
+        for _ in range(20):  # The gateway delays its replies.
+            served.serve(echo)
+            clock.sleep_until(clock.now() + bounds.REFUSAL_TIME)
+        assert client.told() == {"ok": True, "heard": "arm"}
+
+
 @pytest.mark.parametrize("prefix", [b"\xa7command\xa4", b"\xd9\x07command\xd9\x04"])
 def test_a_stop_is_urgent_in_each_format_of_short_strings(served, context, addresses, prefix):
     client = Asking(context, served, addresses[1], b"\x81" + prefix + b"stop")
