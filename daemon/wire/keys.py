@@ -118,8 +118,7 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
     Raises
     ------
     KeyFileError
-        If a file can't be written or a client already exists. In the second case, no files are
-        written.
+        If a file can't be written or a client already exists. In both cases, no new files remain.
     """
     check_curve()
     server = folder / "server"
@@ -139,20 +138,25 @@ def make_keys(folder: Path, names: list[str]) -> list[Path]:
             f"{folder}: the server's keys already exist; to add clients, give their names"
         )
     before = os.umask(0o077)
+    made: list[Path] = []
     try:
         (server / "clients").mkdir(parents=True, exist_ok=True)
         check_above(server / "clients" / "any")
         if new:
+            made += server / "server.key", server / "server.key_secret"
             zmq.auth.create_certificates(server, "server")
         for name in wanted:
             client = folder / name
             client.mkdir()
+            made += client, server / "clients" / f"{name}.key"
             zmq.auth.create_certificates(client, "client")
             shutil.copyfile(server / "server.key", client / "server.key")
             # Move the public key last, so that the server accepts only clients that have all their
             # keys.
             (client / "client.key").rename(server / "clients" / f"{name}.key")
     except OSError as error:
+        for path in made:
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         text = f"{error.filename or folder}: {error.strerror}" if error.errno else str(error)
         raise KeyFileError(text) from None
     finally:

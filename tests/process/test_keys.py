@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,6 +64,28 @@ def test_adding_a_client_overwrites_no_files(folder):
             make_keys(folder, names)
     assert not (folder / "carol").exists()
     assert all(path.read_bytes() == text for path, text in before.items())
+
+
+@pytest.mark.parametrize("new", [True, False])
+def test_a_full_disk_leaves_no_incomplete_keys(tmp_path, monkeypatch, new):
+    folder = tmp_path / "keys"
+    if not new:
+        make_keys(folder, [])
+    before = {path for path in folder.rglob("*") if path.is_file()}
+    copy = shutil.copyfile
+
+    def copy_all_but_the_last(source: Path, target: Path) -> object:
+        if target.parent.name == "bob":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+        return copy(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copyfile", copy_all_but_the_last)
+        with pytest.raises(KeyFileError, match=r"bob/server.key: No space left on device"):
+            make_keys(folder, ["alice", "bob"])
+    assert {path for path in folder.rglob("*") if path.is_file()} == before
+    make_keys(folder, ["alice", "bob"])
+    assert sorted(load_server(folder).clients.values()) == ["alice", "bob", "local"]
 
 
 def test_damaged_missing_and_readable_key_files_are_reported(folder):
