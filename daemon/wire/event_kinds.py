@@ -69,10 +69,11 @@ KINDS: dict[str, EventKind] = {
     ),
     "clients": EventKind(
         "warning",
-        "The gateway process, which serves the clients, exited, was suspended, or rejected a "
-        "client.",
-        "The process restarts automatically. If the event recurs, look for a client that sends "
-        "too many messages.",
+        "The gateway process, which serves the clients, exited, was suspended, disconnected "
+        "clients without a key file, or can't start. The event also reports that the local stop "
+        "socket is not in the usual folder.",
+        "Correct the file or folder that the message names. Otherwise, the process restarts "
+        "automatically. If the event recurs, look for a client that sends too many messages.",
     ),
     "record": EventKind(
         "error", "The recorder started by `run --record` has exited.", "Check the free disk space."
