@@ -63,8 +63,7 @@ def check_servos(settings: Settings) -> list[Finding]:
     servos = settings.servos
     model = by_name(servos.model)
     try:
-        # Do not request low-latency mode, because the request would change the adapter's settings.
-        with open_line(servos.port, servos.baud, low_latency=False) as line:
+        with open_line(servos.port, servos.baud) as line:
             _wait_for(line, settings)
             found = examine(line, settings, model)
             exchange = _try_exchange(line, settings, model, found)

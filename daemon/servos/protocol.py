@@ -423,9 +423,10 @@ class ServoLine:
 
 
 @contextlib.contextmanager
-def open_line(path: str, baud: int, low_latency: bool = True) -> Iterator[ServoLine]:
+def open_line(path: str, baud: int, low_latency: bool = False) -> Iterator[ServoLine]:
     """Open a port, yield a `ServoLine` for the port, and close the port afterwards.
 
+    The adapter stays in low-latency mode if ``low_latency`` is True, and is unchanged otherwise.
     Raises ServoError if the port can't be opened.
     """
     port = SerialPort(path, baud, UNPACED_TIMEOUT, low_latency)

@@ -244,7 +244,7 @@ def provision(settings: Settings) -> list[Finding]:
     result: list[Finding] = []
     model = by_name(servos.model)
     fingers = {servos.ids[f]: f for f in map(FINGERS.index, settings.scene.fingers)}
-    with open_line(servos.port, servos.baud) as line:
+    with open_line(servos.port, servos.baud, low_latency=True) as line:
         complete = all(line.ping(servo_id) is not None for servo_id in fingers)
     if not complete:
         found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})

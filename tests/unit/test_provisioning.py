@@ -114,10 +114,10 @@ class Bus:
         self.t = 0.0
 
     @contextlib.contextmanager
-    def line(self, path: str, baud: int, timeout: float = UNPACED_TIMEOUT) -> Iterator[ServoLine]:
+    def line(self, path: str, baud: int, low_latency: bool = False) -> Iterator[ServoLine]:
         if baud < 0:
             raise ServoError("no such rate")
-        port = DirectPort(self.bus, baud, timeout, self.t)
+        port = DirectPort(self.bus, baud, UNPACED_TIMEOUT, self.t)
         yield ServoLine(port)
         self.t = port.t
 
