@@ -96,8 +96,6 @@ class SerialPort(PortHandler):  # type: ignore[misc]
                 self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
             pass  # Pseudo-terminals and some adapters lack low-latency mode.
-        self.received.clear()
-        self.ser.reset_input_buffer()
         return True
 
     def closePort(self) -> None:

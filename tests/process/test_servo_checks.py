@@ -156,6 +156,12 @@ def test_unusable_ports_are_reported(bus):
     connected(bus).close()  # The port is available again.
 
 
+def test_a_port_lost_while_it_is_opened_is_reported(bus, monkeypatch):
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda *_: bus.fault("unplug"))
+    (line,) = refusal(bus.port)
+    assert line.startswith(f"{bus.port}: the port is lost (")
+
+
 def test_minor_findings_are_notices(bus):
     servo = bus.servo(0)
     bus.call(lambda: servo.table.set(reg.DRIVE_MODE, 0b0001))
