@@ -6,6 +6,8 @@ The file contains JSON with the register names from `servos.register_table.REGIS
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import ValidationError, model_validator
@@ -55,7 +57,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
     """Save the registers of each servo that replies, except for ID and baud rate."""
     servos: list[StoredServo] = []
     found = []
-    with open_line(settings.servos.port, settings.servos.baud) as line:
+    with _open(settings) as line:
         for finger in settings.scene.indices:
             servo_id = settings.servos.ids[finger]
             table = Registers.read(line, servo_id)
@@ -85,7 +87,7 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
     """
     stored = _stored(path)
     result: list[Finding] = []
-    with open_line(settings.servos.port, settings.servos.baud) as line:
+    with _open(settings) as line:
         for finger in settings.scene.indices:
             servo_id = settings.servos.ids[finger]
             name, kept = servo_name(servo_id, finger), stored.get(servo_id)
@@ -141,6 +143,16 @@ def _restore(
         else:
             text = f"{each.name} {now} could not be set to {wanted}"
             result.append(Finding("warn", name, text))
+
+
+@contextlib.contextmanager
+def _open(settings: Settings) -> Iterator[ServoLine]:
+    """Open the servo port and wait for the servos, as `softfinger run` does."""
+    servos = settings.servos
+    with open_line(servos.port, servos.baud) as line:
+        ids = [servos.ids[finger] for finger in settings.scene.indices]
+        line.wait_for(ids, servos.open_timeout)
+        yield line
 
 
 def _stored(path: Path) -> dict[int, StoredServo]:

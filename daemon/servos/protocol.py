@@ -27,7 +27,7 @@ import os
 import select
 import struct
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dynamixel_sdk import robotis_def as sdk
@@ -356,6 +356,18 @@ class ServoLine:
             if result == sdk.COMM_SUCCESS:
                 return int(number)
         return None
+
+    def wait_for(self, ids: Iterable[int], seconds: float) -> list[int]:
+        """Ping servos for up to ``seconds``; return the IDs of servos that have not replied.
+
+        An adapter that restarts when its port is opened is silent for a few seconds.
+        """
+        end, missing = time.monotonic() + seconds, list(ids)
+        while missing:
+            missing = [servo_id for servo_id in missing if self.ping(servo_id, tries=1) is None]
+            if time.monotonic() > end:
+                break
+        return missing
 
     def ping_old(self, servo_id: int) -> bool:
         """Return True if a servo replies to a Protocol 1.0 ping."""
