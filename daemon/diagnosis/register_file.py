@@ -165,9 +165,10 @@ def _stored(path: Path) -> dict[int, StoredServo]:
     except OSError as error:
         raise ServoError(f"{path}: {error.strerror or error}") from None
     except ValidationError as error:
-        where = ".".join(str(each) for each in error.errors()[0]["loc"])
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "contents"
         raise ServoError(
-            f"{path}: {where}: {error.errors()[0]['msg']}; expected a file written by `softfinger "
+            f"{path}: {where}: {first['msg']}; expected a file written by `softfinger "
             "doctor --save`"
         ) from None
     return {each.id: each for each in stored.servos}

@@ -15,6 +15,8 @@ from unittest.mock import Mock
 import pytest
 
 from softfinger.daemon.diagnosis import devices, machine, ports
+from softfinger.daemon.diagnosis.register_file import restore_registers
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
@@ -139,6 +141,20 @@ def test_servos_are_not_repaired_if_their_registers_cannot_be_saved(hands, capsy
     assert "servos: not repaired, because their registers were not saved" in with_status(
         lines, "warn"
     )
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("{", "contents: Invalid JSON: "),
+        ('{"servos": [{"id": 1}]}', "servos.0.model: Field required"),
+    ],
+)
+def test_invalid_register_files_are_reported_with_the_position(tmp_path, content, told):
+    path = tmp_path / "servos.json"
+    path.write_text(content)
+    with pytest.raises(ServoError, match=f"{path}: {told}"):
+        restore_registers(Settings(), path)
 
 
 @pytest.mark.parametrize("option", ["save", "restore"])
