@@ -63,9 +63,9 @@ def check_servos(settings: Settings) -> list[Finding]:
     servos = settings.servos
     model = by_name(servos.model)
     try:
-        # Do not request low-latency mode, because the request would change the adapter's settings.
-        with open_line(servos.port, servos.baud, low_latency=False) as line:
-            _wait_for(line, settings)
+        with open_line(servos.port, servos.baud) as line:
+            ids = [servos.ids[finger] for finger in settings.scene.indices]
+            line.wait_for(ids, servos.open_timeout)
             found = examine(line, settings, model)
             exchange = _try_exchange(line, settings, model, found)
             silent = [each.joint.id for each in found if not each.replies]
@@ -79,16 +79,6 @@ def check_servos(settings: Settings) -> list[Finding]:
     except ServoError as error:
         return [Finding("FAIL", "servos", str(error))]
     return results
-
-
-def _wait_for(line: ServoLine, settings: Settings) -> None:
-    """Wait up to ``servos.open_timeout`` for missing servos, as `softfinger run` does."""
-    end = time.monotonic() + settings.servos.open_timeout
-    missing = [settings.servos.ids[finger] for finger in settings.scene.indices]
-    while missing:
-        missing = [servo_id for servo_id in missing if line.ping(servo_id, tries=1) is None]
-        if time.monotonic() > end:
-            break
 
 
 def _try_exchange(

@@ -6,6 +6,8 @@ The file contains JSON with the register names from `servos.register_table.REGIS
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import ValidationError, model_validator
@@ -55,7 +57,7 @@ def save_registers(settings: Settings, path: Path) -> list[Finding]:
     """Save the registers of each servo that replies, except for ID and baud rate."""
     servos: list[StoredServo] = []
     found = []
-    with open_line(settings.servos.port, settings.servos.baud) as line:
+    with _open(settings) as line:
         for finger in settings.scene.indices:
             servo_id = settings.servos.ids[finger]
             table = Registers.read(line, servo_id)
@@ -85,7 +87,7 @@ def restore_registers(settings: Settings, path: Path) -> list[Finding]:
     """
     stored = _stored(path)
     result: list[Finding] = []
-    with open_line(settings.servos.port, settings.servos.baud) as line:
+    with _open(settings) as line:
         for finger in settings.scene.indices:
             servo_id = settings.servos.ids[finger]
             name, kept = servo_name(servo_id, finger), stored.get(servo_id)
@@ -143,6 +145,16 @@ def _restore(
             result.append(Finding("warn", name, text))
 
 
+@contextlib.contextmanager
+def _open(settings: Settings) -> Iterator[ServoLine]:
+    """Open the servo port and wait for the servos, as `softfinger run` does."""
+    servos = settings.servos
+    with open_line(servos.port, servos.baud) as line:
+        ids = [servos.ids[finger] for finger in settings.scene.indices]
+        line.wait_for(ids, servos.open_timeout)
+        yield line
+
+
 def _stored(path: Path) -> dict[int, StoredServo]:
     """Read a register file and return a dictionary of its servos, keyed by ID.
 
@@ -153,9 +165,10 @@ def _stored(path: Path) -> dict[int, StoredServo]:
     except OSError as error:
         raise ServoError(f"{path}: {error.strerror or error}") from None
     except ValidationError as error:
-        where = ".".join(str(each) for each in error.errors()[0]["loc"])
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "contents"
         raise ServoError(
-            f"{path}: {where}: {error.errors()[0]['msg']}; expected a file written by `softfinger "
+            f"{path}: {where}: {first['msg']}; expected a file written by `softfinger "
             "doctor --save`"
         ) from None
     return {each.id: each for each in stored.servos}

@@ -142,7 +142,7 @@ class ServoModel:
     velocity_limit: int  # default
     velocity_max: int  # upper bound of the velocity limit
     temperature_limit: int  # default [°C]
-    voltage_min: int  # default and lower bound of the voltage limits [0.1 V]
+    voltage_min: int  # default of the minimum voltage limit [0.1 V]
     voltage_max: int  # default and upper bound of the voltage limits [0.1 V]
     velocity_gains: tuple[int, int]  # I, P
     position_gains: tuple[int, int, int]  # D, I, P
@@ -187,6 +187,14 @@ class ServoModel:
     def supply(self) -> float:
         """Middle of the supply voltage range [V]."""
         return (self.voltage_min + self.voltage_max) / 2.0 * VOLTAGE_UNIT
+
+    @property
+    def voltage_bound(self) -> int:
+        """Lower bound of the voltage limits [0.1 V]. Models for 5 V accept 31, others the default.
+
+        The source is the range of registers 32 and 34 in the e-Manual's control tables.
+        """
+        return 31 if self.voltage_min == 35 else self.voltage_min
 
     @property
     def resistance(self) -> float:

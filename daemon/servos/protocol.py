@@ -27,7 +27,7 @@ import os
 import select
 import struct
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dynamixel_sdk import robotis_def as sdk
@@ -96,8 +96,6 @@ class SerialPort(PortHandler):  # type: ignore[misc]
                 self.ser.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
             pass  # Pseudo-terminals and some adapters lack low-latency mode.
-        self.received.clear()
-        self.ser.reset_input_buffer()
         return True
 
     def closePort(self) -> None:
@@ -359,6 +357,18 @@ class ServoLine:
                 return int(number)
         return None
 
+    def wait_for(self, ids: Iterable[int], seconds: float) -> list[int]:
+        """Ping servos for up to ``seconds``; return the IDs of servos that have not replied.
+
+        An adapter that restarts when its port is opened is silent for a few seconds.
+        """
+        end, missing = time.monotonic() + seconds, list(ids)
+        while missing:
+            missing = [servo_id for servo_id in missing if self.ping(servo_id, tries=1) is None]
+            if time.monotonic() > end:
+                break
+        return missing
+
     def ping_old(self, servo_id: int) -> bool:
         """Return True if a servo replies to a Protocol 1.0 ping."""
         port = self.port
@@ -423,9 +433,10 @@ class ServoLine:
 
 
 @contextlib.contextmanager
-def open_line(path: str, baud: int, low_latency: bool = True) -> Iterator[ServoLine]:
+def open_line(path: str, baud: int, low_latency: bool = False) -> Iterator[ServoLine]:
     """Open a port, yield a `ServoLine` for the port, and close the port afterwards.
 
+    The adapter stays in low-latency mode if ``low_latency`` is True, and is unchanged otherwise.
     Raises ServoError if the port can't be opened.
     """
     port = SerialPort(path, baud, UNPACED_TIMEOUT, low_latency)

@@ -244,15 +244,16 @@ def provision(settings: Settings) -> list[Finding]:
     result: list[Finding] = []
     model = by_name(servos.model)
     fingers = {servos.ids[f]: f for f in map(FINGERS.index, settings.scene.fingers)}
-    with open_line(servos.port, servos.baud) as line:
-        complete = all(line.ping(servo_id) is not None for servo_id in fingers)
-    if not complete:
+    with open_line(servos.port, servos.baud, low_latency=True) as line:
+        missing = line.wait_for(fingers, servos.open_timeout)
+    if missing:
         found = search(servos.port, model.baud_rates, SEARCH_TIME, {FACTORY_ID, *servos.ids})
         what = plan(found, settings, model)
         for change in what.changes:
             result += _identify(servos.port, change, model)
         result += _unknown(settings, found, what)
     with open_line(servos.port, servos.baud) as line:
+        line.wait_for(fingers, servos.open_timeout)
         for servo_id, finger in fingers.items():
             name, number = servo_name(servo_id, finger), line.ping(servo_id)
             if number is None:

@@ -15,6 +15,8 @@ from unittest.mock import Mock
 import pytest
 
 from softfinger.daemon.diagnosis import devices, machine, ports
+from softfinger.daemon.diagnosis.register_file import restore_registers
+from softfinger.daemon.errors import ServoError
 from softfinger.daemon.loop import warm_up
 from softfinger.daemon.perception.calibration_file import (
     Calibration,
@@ -127,6 +129,41 @@ def test_registers_are_stored_before_a_change_and_restored(hands, capsys, tmp_pa
     assert [memory[: reg.RAM] for memory in hand.registers()] == before
     status, lines = hand.doctor(capsys, "--restore", str(tmp_path / "none.json"))
     assert f"{tmp_path}/none.json: No such file or directory" in lines[-1] + "".join(lines)
+
+
+def test_servos_are_not_repaired_if_their_registers_cannot_be_saved(hands, capsys, tmp_path):
+    hand = hands(factory=True)
+    before = hand.registers()
+    status, lines = hand.doctor(capsys, "--save", str(tmp_path / "none" / "x.json"), "--fix")
+    assert status == 1
+    assert hand.registers() == before
+    assert with_status(lines, "fixed") == []
+    assert "servos: not repaired, because their registers were not saved" in with_status(
+        lines, "warn"
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("{", "contents: Invalid JSON: "),
+        ('{"servos": [{"id": 1}]}', "servos.0.model: Field required"),
+    ],
+)
+def test_invalid_register_files_are_reported_with_the_position(tmp_path, content, told):
+    path = tmp_path / "servos.json"
+    path.write_text(content)
+    with pytest.raises(ServoError, match=f"{path}: {told}"):
+        restore_registers(Settings(), path)
+
+
+@pytest.mark.parametrize("option", ["save", "restore"])
+def test_register_files_without_a_servo_port_fail(tmp_path, option):
+    path = tmp_path / "servos.json"
+    checks = doctor.results(Settings(), False, **{option: path})
+    found = next(each for each in checks if each.status == "FAIL")
+    assert found.subject == str(path)
+    assert f"no registers were {option}d, because there is no servo port to use" in found.text
 
 
 @pytest.mark.extended

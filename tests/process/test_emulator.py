@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from softfinger.daemon.clock import Deadline, HandClock, RealClock
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.perception.finger_model import make_estimator
 from softfinger.daemon.profile.factory import make_material
 from softfinger.daemon.profile.load import load
@@ -22,7 +23,7 @@ from softfinger.daemon.simulation.emulator.emulator import (
     EmulatorClock,
     with_board,
 )
-from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, LinkFolder
+from softfinger.daemon.simulation.emulator.folder import LINKS, FolderError, LinkFolder, carry_out
 from softfinger.daemon.tactile.base import make_sensor
 from tests.conftest import until
 from tests.harness.emulated import HIL, EmulatorProcess, SdkServos, board, emulated, send
@@ -363,3 +364,9 @@ def test_an_object_is_put_back_and_moved_by_a_load(tmp_path):
         assert made.report(made.clock.now())["force"] == [0.0, 0.0]
         made.request("place twist=0.02")
         until(lambda: made.hand.object_pose[2] > 0.05)
+
+
+def test_a_message_that_the_emulator_would_cut_off_is_refused(tmp_path):
+    presses = "press " + ",".join(300 * ["depth=1mm tip=left"])
+    with pytest.raises(Refused, match="found 5705 bytes, expected at most 4096"):
+        carry_out(tmp_path, presses)

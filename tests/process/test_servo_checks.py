@@ -11,6 +11,8 @@ import pytest
 import serial
 
 from softfinger.daemon.clock import RealClock, VirtualClock
+from softfinger.daemon.diagnosis.devices import check_servos
+from softfinger.daemon.diagnosis.register_file import restore_registers, save_registers
 from softfinger.daemon.errors import ServoError
 from softfinger.daemon.profile.load import find, load
 from softfinger.daemon.profile.settings import Settings
@@ -21,6 +23,7 @@ from softfinger.daemon.servos.checks import latency_file
 from softfinger.daemon.servos.control_table import by_name
 from softfinger.daemon.servos.dynamixel import DynamixelServos
 from softfinger.daemon.servos.protocol import SerialPort
+from softfinger.daemon.servos.provisioning import provision, search
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.simulation.servo_model.servo_joint import ServoHeat
 from softfinger.daemon.types import Goal, Reading
@@ -153,6 +156,12 @@ def test_unusable_ports_are_reported(bus):
     connected(bus).close()  # The port is available again.
 
 
+def test_a_port_lost_while_it_is_opened_is_reported(bus, monkeypatch):
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda *_: bus.fault("unplug"))
+    (line,) = refusal(bus.port)
+    assert line.startswith(f"{bus.port}: the port is lost (")
+
+
 def test_minor_findings_are_notices(bus):
     servo = bus.servo(0)
     bus.call(lambda: servo.table.set(reg.DRIVE_MODE, 0b0001))
@@ -219,6 +228,19 @@ def test_an_adapter_is_set_to_low_latency(bus, tmp_path, monkeypatch):
     port = SerialPort(bus.port, 2_000_000, 1.0, low_latency=False)
     port.openPort()
     port.closePort()
+    assert asked == [True]
+
+
+def test_only_a_repair_changes_the_latency_of_an_adapter(bus, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda _, on: asked.append(on))
+    settings = backend_settings(bus.port)
+    check_servos(settings)
+    save_registers(settings, tmp_path / "servos.json")
+    restore_registers(settings, tmp_path / "servos.json")
+    search(bus.port, (2_000_000,), 0.01)
+    assert asked == []
+    provision(settings)
     assert asked == [True]
 
 

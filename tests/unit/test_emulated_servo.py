@@ -61,6 +61,15 @@ def test_configured_limits_are_enforced() -> None:
     assert c.write(reg.MIN_POSITION_LIMIT, 3001, 4) == framing.DATA_LIMIT
 
 
+@pytest.mark.parametrize(
+    ("model", "lowest"), [("XL330-M288", 31), ("XC330-M181", 31), ("XC330-T288", 55)]
+)
+def test_voltage_limits_start_at_the_bound_in_the_manual(model: str, lowest: int) -> None:
+    c = BusClient(model=model)
+    assert c.write(reg.MIN_VOLTAGE_LIMIT, lowest - 1, 2) == framing.DATA_RANGE
+    assert c.write(reg.MIN_VOLTAGE_LIMIT, lowest, 2) == framing.OK
+
+
 def test_eeprom_is_locked_while_torque_is_on() -> None:
     c = BusClient()
     assert c.write(reg.TORQUE_ENABLE, 1, 1) == 0

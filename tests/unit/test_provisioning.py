@@ -108,16 +108,17 @@ class Bus:
     """Bus with the servos of the settings on free joints; ``silent`` servos are unplugged."""
 
     def __init__(self, baud: int = HOME, **options: Any) -> None:
-        self.settings = Settings.model_validate({"servos": {"backend": "dynamixel"}})
+        servos = {"backend": "dynamixel", "open_timeout": 0.001}
+        self.settings = Settings.model_validate({"servos": servos})
         self.bus = ServoBus.from_settings(self.settings, FreeJoints(2), baud=baud, **options)
         self.servos = self.bus.servos
         self.t = 0.0
 
     @contextlib.contextmanager
-    def line(self, path: str, baud: int, timeout: float = UNPACED_TIMEOUT) -> Iterator[ServoLine]:
+    def line(self, path: str, baud: int, low_latency: bool = False) -> Iterator[ServoLine]:
         if baud < 0:
             raise ServoError("no such rate")
-        port = DirectPort(self.bus, baud, timeout, self.t)
+        port = DirectPort(self.bus, baud, UNPACED_TIMEOUT, self.t)
         yield ServoLine(port)
         self.t = port.t
 
@@ -140,6 +141,16 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Bus]:
         return bus
 
     return make
+
+
+class RestartingPort(DirectPort):
+    """Port of an adapter that restarts when it is opened and loses the first packets."""
+
+    lost = 10  # number of packets that will be lost
+
+    def send(self, packet: bytes, reply: int = 0, until: float = math.inf) -> bool:
+        self.lost -= 1
+        return self.lost >= 0 or super().send(packet, reply, until)
 
 
 MODE_AND_DELAY = ["operating mode 3 → 5", "return delay 250 → 0"]
@@ -196,6 +207,13 @@ def test_two_factory_servos_are_configured_one_after_the_other(wired):
     assert bus.addresses() == [(1, HOME), (2, HOME)]
     assert bus.provision() == ([], [])
     assert not any(each.torque_on for each in bus.servos)
+
+
+def test_a_repair_waits_for_an_adapter_that_restarts(wired, monkeypatch):
+    bus = wired(factory=True)
+    monkeypatch.setitem(globals(), "DirectPort", RestartingPort)
+    done = [*named(LEFT, *MODE_AND_DELAY), *named(RIGHT, *MODE_AND_DELAY)]
+    assert bus.provision(open_timeout=60.0) == (done, [])
 
 
 def test_factory_servos_with_the_same_id_are_reported_and_not_changed(wired):

@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--save",
         type=Path,
         metavar="FILE",
-        help="store the servo registers in FILE before any other action",
+        help="store the servo registers in FILE before changing any of them",
     )
 
 
@@ -103,9 +103,14 @@ def results(
             # timeout of 1 s, every latency timer is acceptable.
             timeout = settings.servos.reply_timeout if key == "servos.port" else 1.0
             yield from _latency(path, timeout, fix)
-    if free.get("servos.port"):
-        yield from _register_files(settings, save, restore)
-    yield from _servos(settings, free.get("servos.port", False), fix)
+    usable, saved = free.get("servos.port", False), True
+    for found in _register_files(settings, usable, save, restore):
+        saved = saved and found.status != "FAIL"
+        yield found
+    if fix and not saved:
+        text = "not repaired, because their registers were not saved"
+        yield Finding("warn", "servos", text, "correct the error above, or omit --save")
+    yield from _servos(settings, usable, fix and saved)
     for warning in plausibility_warnings(settings):
         yield Finding("warn", "settings", warning)
     tactile = settings.tactile
@@ -124,8 +129,15 @@ def results(
 
 
 def _register_files(
-    settings: Settings, save: Path | None, restore: Path | None
+    settings: Settings, port_is_free: bool, save: Path | None, restore: Path | None
 ) -> Iterator[Finding]:
+    if not port_is_free:
+        for path, action in ((save, "saved"), (restore, "restored")):
+            if path is not None:
+                text = f"no registers were {action}, because there is no servo port to use"
+                fix = "use a profile with Dynamixel servos, and correct errors of their port"
+                yield Finding("FAIL", str(path), text, fix)
+        return
     try:
         if save is not None:
             yield from save_registers(settings, save)

@@ -220,7 +220,13 @@ def send_words(folder: Path, text: str) -> str:
     ------
     NoEmulator
         If no emulator is running in the folder, or if the emulator does not reply.
+    Refused
+        If the text is too long. The emulator would read only its beginning.
     """
+    message = text.encode()
+    if len(message) > _MESSAGE_SIZE_MAX:
+        problem = f"found {len(message)} bytes, expected at most {_MESSAGE_SIZE_MAX}"
+        raise Refused(f"{problem}: send fewer words at a time", Reason.REQUEST)
     try:
         with contextlib.ExitStack() as opened:
             descriptor = os.open(folder, _DIRECTORY)
@@ -229,7 +235,7 @@ def send_words(folder: Path, text: str) -> str:
             opened.enter_context(client)
             client.settimeout(_CLIENT_TIMEOUT)
             client.connect(_address(descriptor))
-            client.send(text.encode())
+            client.send(message)
             reply = client.recv(_REPLY_SIZE_MAX)
     except OSError:
         raise NoEmulator(f"{folder}: no emulator is running here") from None

@@ -53,7 +53,7 @@ class Item(NamedTuple):
 
 def _items_of(model: ServoModel, firmware: int) -> list[Item]:
     """Return all registers for a model and firmware, sorted by address."""
-    low, high = model.voltage_min, model.voltage_max
+    low, high = model.voltage_bound, model.voltage_max
     items = [
         Item(reg.MODEL_NUMBER, 2, model.number),
         Item(reg.MODEL_INFORMATION, 4),
@@ -69,7 +69,7 @@ def _items_of(model: ServoModel, firmware: int) -> list[Item]:
         Item(reg.MOVING_THRESHOLD, 4, 10, 0, 1023),
         Item(reg.TEMPERATURE_LIMIT, 1, model.temperature_limit, 0, 100),
         Item(reg.MAX_VOLTAGE_LIMIT, 2, high, low, high),
-        Item(reg.MIN_VOLTAGE_LIMIT, 2, low, low, high),
+        Item(reg.MIN_VOLTAGE_LIMIT, 2, model.voltage_min, low, high),
         Item(reg.PWM_LIMIT, 2, 885, 0, 885),
         Item(reg.VELOCITY_LIMIT, 4, model.velocity_limit, 0, model.velocity_max),
         Item(reg.MAX_POSITION_LIMIT, 4, 4095, 0, 4095),
