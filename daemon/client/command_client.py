@@ -20,7 +20,6 @@ from softfinger.daemon.client.connection import (
     SILENCE_TIME,
     OneThread,
     both_addresses,
-    is_host,
     milliseconds,
     require_address,
     still_waiting,
@@ -194,11 +193,9 @@ class HandClient(Generic[_Done]):
         timeout: float = REPLY_TIMEOUT,
         keys: Path | None = None,
     ) -> None:
-        if stream and not commands and ("," in stream or is_host(stream)):
-            stream, commands = both_addresses(stream)
-        elif not (stream and commands):
-            usual = both_addresses()
-            stream, commands = stream or usual[0], commands or usual[1]
+        if not (stream and commands):
+            # One address alone might select the stream of one hand and the commands of another.
+            stream, commands = both_addresses(stream or commands or "")
         self.stream_address, self.command_address = stream, commands
         for address in (self.stream_address, self.command_address):
             require_address(address)

@@ -63,9 +63,10 @@ class Hand(HandClient[None]):
     Parameters
     ----------
     stream, commands
-        Addresses of the daemon. ``stream`` may also specify both addresses, as ``tcp://HOST`` or
-        ``STREAM,COMMANDS``. By default, the addresses are read from the SOFTFINGER_ADDRESS
-        environment variable. If the variable is not set, the addresses refer to this machine.
+        Addresses of the daemon. Give both, or give one string for both in ``stream``, as
+        ``tcp://HOST`` or ``STREAM,COMMANDS``. By default, the addresses are read from the
+        SOFTFINGER_ADDRESS environment variable. If the variable is not set, the addresses refer to
+        this machine.
     client
         Client name for the command lease.
     timeout
@@ -76,7 +77,7 @@ class Hand(HandClient[None]):
     Raises
     ------
     SettingsError
-        If an address is malformed, or its host is unknown.
+        If an address is malformed, its host is unknown, or one of two addresses is missing.
     KeyFileError
         If the keys can't be read.
     """

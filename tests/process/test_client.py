@@ -500,7 +500,7 @@ UNKNOWN = "unknown host 'no..host' (not a host name); expected an IP address or 
     "given",
     [
         {"stream": "tcp://no..host"},
-        {"stream": "tcp://no..host:9872"},
+        {"stream": "tcp://no..host:9872", "commands": COMMAND_ADDRESS},
         {"stream": STREAM_ADDRESS, "commands": "tcp://no..host:9873"},
     ],
 )
@@ -522,6 +522,12 @@ def test_a_malformed_address_fails_at_once(cls, inline, address):
     if cls is Hand and address != "tcp://127.0.0.1":
         done = inline("status", "--address", address)
         assert (done.returncode, "malformed address" in done.stderr) == (2, True)
+
+
+@pytest.mark.parametrize("given", [{"stream": "tcp://[::1]:9872"}, {"commands": "tcp://[::1]:9"}])
+def test_one_address_alone_is_an_error_instead_of_another_hand(given):
+    with pytest.raises(SettingsError, match="expected tcp://HOST or STREAM,COMMANDS"):
+        Hand(**given)
 
 
 def test_a_host_that_the_resolver_does_not_know_is_named_with_its_reason(monkeypatch):
