@@ -21,7 +21,7 @@ from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.heatmap import picture, resample
 from softfinger.tools.terminal.monitor_page import MonitorPage
-from softfinger.tools.terminal.stream_state import Commander, ShownReply, StreamState
+from softfinger.tools.terminal.stream_state import Commander, ShownReply, StreamState, judge
 from softfinger.tools.terminal.terminal import KeyDecoder
 from tests.conftest import until
 from tests.harness import fake_daemon
@@ -324,6 +324,12 @@ def test_row_0_is_at_the_bottom_and_column_0_on_the_left():
         "    ",
         "█   ",
     ]
+
+
+@pytest.mark.parametrize("label", ["", " "])
+def test_a_refusal_of_a_command_without_a_name_is_shown(label):
+    shown = judge(1.0, label, {"ok": False, "error": "found no command"})
+    assert shown.text.endswith("found no command")
 
 
 def test_a_stop_overtakes_and_discards_waiting_commands(tmp_path):
