@@ -38,7 +38,8 @@ from softfinger.tools.viewing.page import listen
 from softfinger.tools.viewing.pictures import COLUMNS, TOPICS, Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
-from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
+from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, now, state
+from tests.harness.golden_wire import sample
 from tests.harness.recorded_hand import record_hand, write_recording
 from tests.harness.viewed import WAIT, Viewed, Watcher, masked, upgrade_request
 
@@ -232,6 +233,20 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     assert picture["panels"]["hand"]["texts"][0][3] == "7.5 N"
     assert "the stream uses schema 2, but this page supports schema 1" in picture["notes"]
     assert "0 messages could not be read" in said
+
+
+def test_the_true_object_disappears_with_the_simulated_hand() -> None:
+    kept = Kept()
+
+    def line_count(seq: int) -> int:
+        kept.pictures.take(schema.STATE, state(0.0, seq))
+        kept.pictures.draw()
+        return len(kept.newest["panels"]["hand"]["lines"])
+
+    without = line_count(5)
+    kept.pictures.take(schema.TRUTH, sample(schema.TRUTH) | now())
+    assert line_count(6) == without + 1
+    assert line_count(1) == without  # Another daemon, which controls real servos, was started.
 
 
 def test_images_of_tips_without_contact_are_blank() -> None:
