@@ -511,6 +511,12 @@ def test_a_recording_is_saved_as_a_moving_picture(recorded, tmp_path):
     assert len(lines) >= 6 + 5  # The lines show the fingers, tips, contacts, arrows and object.
 
 
+def test_a_long_recording_is_saved_with_a_valid_duration(recorded, tmp_path):
+    save(tmp_path / "run.svg", Recording(recorded), 3000.0, print)
+    # A duration in SVG has no exponent.
+    assert set(re.findall(r'dur="(.*?)"', (tmp_path / "run.svg").read_text())) == {"6000s"}
+
+
 def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline):
     with pytest.raises(ViewError, match="pictures, expected at most 6000; choose a lower --rate"):
         save(tmp_path / "a.html", Recording(recorded), 1e-4, print)
