@@ -546,6 +546,7 @@ def test_invalid_messages_are_tolerated() -> None:
     odd += [{**frame(0.0, 0), "data": b"abc"}, {**frame(0.0, 0), "pitch": -1.0}]
     odd += [{"timestamp": 1e9, "settings": "{", "request": "{", "command": "grasp", "ok": True}]
     odd += [{**state(0.0, 1), "mode": "\x1b[31m", "left": {**finger(0.0, 0), "q": 1e308}}]
+    odd += [{**state(0.0, 1), "left": {**finger(0.0, 0), "q": math.inf}}]
     kept = Kept(live=True)
     for topic in (*TOPICS, b"hand/news"):
         for message in odd:
