@@ -1,6 +1,7 @@
 """Test the pictures, the access control and the errors of ``softfinger view``."""
 
 import argparse
+import asyncio
 import base64
 import gzip
 import http.client
@@ -12,7 +13,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from email.message import Message
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ import zmq
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
@@ -34,7 +36,7 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.viewing import sources
 from softfinger.tools.viewing.document import save
-from softfinger.tools.viewing.page import listen
+from softfinger.tools.viewing.page import Site, listen
 from softfinger.tools.viewing.pictures import COLUMNS, TOPICS, Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
@@ -372,7 +374,7 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
     grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
     with (
         FakeDaemon() as fake,
-        view(fake, "--timeout", "8") as viewed,
+        view(fake, "--timeout", "60") as viewed,
         Watcher(viewed.host) as page,
     ):
 
@@ -387,14 +389,28 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         }
         assert press() == "✗ grasp: not accepted in mode disarmed; arm first"
         assert fake.requests == [grasp, grasp]
-        late = {"seen": page.next()["now"] - 8.0}
+        late = {"seen": page.next()["now"] - 60.0}
         assert ask(viewed.host, viewed.query, {**grasp, **late}).endswith("s behind")
         assert ask(viewed.host, viewed.query, grasp).startswith('✗ grasp: expected "seen"')
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
             assert ask(viewed.host, viewed.query, odd).startswith("✗ invalid command")
-        fake.close()
-        assert "✗ grasp: no reply" in press()
-        assert len(fake.requests) == 2
+        fake.replies["grasp"] = b"\xc1"
+        assert press().endswith("sent an invalid reply")
+        assert fake.requests == [grasp] * 3
+
+
+def test_a_reply_is_awaited_only_while_the_picture_is_recent() -> None:
+    timeouts: list[float] = []
+
+    def unanswered(_: dict[str, Any], timeout: float) -> dict[str, Any]:
+        timeouts.append(timeout)
+        raise NoAnswer("no reply")
+
+    with closing(asyncio.new_event_loop()) as loop:
+        site = Site(loop, "", unanswered, None, 1000.0, "")
+        asked = {"command": "grasp", "seen": time.monotonic() - 400.0}
+        assert site._answer(orjson.dumps(asked)) == "✗ grasp: no reply"
+    assert 0.0 < timeouts[0] <= 600.0
 
 
 def test_other_machines_need_a_one_time_code() -> None:
