@@ -167,7 +167,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._loop.advance(0.1)
         if self._task != "grasp":
             self._take_hold()
-        self.goals = list(self._loop.state.reading.q)  # joint goals [rad]
+        self.goals = list(self._loop.state.goal.q)  # joint goals [rad]
         self._first = self._hand.object_pose.copy()
         self._potential = self._closed()
         if self._task == "push":
