@@ -184,6 +184,19 @@ def test_the_baseline_closes_each_finger_based_on_its_own_features():
 
 
 @pytest.mark.parametrize(
+    "changes",
+    [
+        ('scene.fingers=["left"]', "scene.object_model=false"),
+        ("servos.backend=none",),
+        ("tactile.backend=none",),
+    ],
+)
+def test_a_hand_without_all_its_parts_is_refused(changes):
+    with pytest.raises(ValueError, match="expected two fingers, servos and tactile sensors"):
+        SoftFingerEnv("grasp", changes=changes)
+
+
+@pytest.mark.parametrize(
     ("control", "reason"), [("joints", "joint has stalled|takes too long"), ("law", "at most 2.7")]
 )
 def test_a_reset_without_a_grip_is_an_error(control, reason):
