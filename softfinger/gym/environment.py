@@ -124,11 +124,18 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         ours = ("loop.clock=virtual", "safety.current_move=1.2")
         file = None if profile is None else Path(profile)
         self._settings = load(file, changes=(*ours, *changes))
+        scene, tactile = self._settings.scene, self._settings.tactile
+        backends = self._settings.servos.backend, tactile.backend
+        if len(scene.fingers) < 2 or "none" in backends:
+            raise ValueError(
+                f"profile: found scene.fingers = {scene.fingers}, servos.backend = {backends[0]!r} "
+                f"and tactile.backend = {backends[1]!r}, expected two fingers, servos and tactile "
+                "sensors; change these settings"
+            )
         build_kernels(self._settings, print_event)
         self._task, self._by_law = task, control == "law"
         self._shaped = shaped and task == "grasp"
         self._daemon: Daemon | None = None
-        tactile = self._settings.tactile
         self.pascal_per_count = tactile.pascal_per_count
         cells = (2, tactile.rows, tactile.cols)
         self._empty = np.zeros(cells[1:], np.uint16)
@@ -167,7 +174,7 @@ class SoftFingerEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._loop.advance(0.1)
         if self._task != "grasp":
             self._take_hold()
-        self.goals = list(self._loop.state.reading.q)  # joint goals [rad]
+        self.goals = list(self._loop.state.goal.q)  # joint goals [rad]
         self._first = self._hand.object_pose.copy()
         self._potential = self._closed()
         if self._task == "push":

@@ -1,6 +1,7 @@
 """Test that ``softfinger analyse`` computes contacts from recorded frames as the daemon does."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Frame, HandInfo, SensorInfo
 from softfinger.daemon.wire import schema
 from softfinger.tools.recordings.analyse import analyse, open_source, write_csv
-from tests.harness.golden_wire import message_maker
+from tests.harness.golden_wire import message_maker, sample
 from tests.harness.recorded_hand import write_recording
 from tests.process.test_export import rows_of
 
@@ -40,9 +41,12 @@ def check(path: Path) -> None:
         assert float(row["energy_J"]) > 0.0
 
 
-def save_stream(path: Path, counts: np.ndarray, settings: Settings) -> None:
+def save_stream(
+    path: Path, counts: np.ndarray, settings: Settings, *commands: dict[str, Any]
+) -> None:
     facts = HandInfo("0.1.0", settings.model_dump_json(), "", "", "", "")
     messages = [(schema.SETTINGS, message_maker(schema.SETTINGS)(1, 1e9, 1.0, facts))]
+    messages += [(schema.COMMAND, sample(schema.COMMAND) | each) for each in commands]
     sensor = SensorInfo(PITCH, PITCH, 0.0, 0.0, 0.0, "count", SCALE, False, "")
     for k, data in enumerate(counts):
         frame = Frame(k + 1, 0.01 * k, 0.01 * k, True, data)
@@ -92,6 +96,21 @@ def test_a_recording_supplies_the_settings_of_its_material(counts, tmp_path):
     own = analyse(open_source(tmp_path / "a.mcap", Settings(), own=True), lambda n: None)
     mine = analyse(open_source(tmp_path / "a.mcap", Settings(), own=False), lambda n: None)
     assert own[0].values["gain"][20] < 0.5 * mine[0].values["gain"][20]
+
+
+def test_a_recorded_tare_sets_the_zero_offset(counts, tmp_path):
+    unloaded = np.zeros((16, 44, 44), np.uint16)
+    frames = np.concatenate((unloaded, counts)) + np.uint16(1500)
+    refused, done = (
+        {"command": "tare", "ok": ok, "timestamp": 1e9, "mono_ns": 0} for ok in (False, True)
+    )
+    save_stream(tmp_path / "tared.mcap", frames, Settings(), done)
+    (tared,) = analyse(open_source(tmp_path / "tared.mcap", Settings(), own=True), print)
+    assert tared.valid[16:].all()
+    assert tared.values["d"][21:] == pytest.approx(DEPTHS[5:], abs=2e-5)
+    save_stream(tmp_path / "refused.mcap", frames, Settings(), refused)
+    (untared,) = analyse(open_source(tmp_path / "refused.mcap", Settings(), own=True), print)
+    assert not untared.valid[16:30].any()
 
 
 def test_a_recording_without_frames_is_an_error(inline, tmp_path):

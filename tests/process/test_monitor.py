@@ -128,8 +128,12 @@ def test_keys_command_the_hand(fake):
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 10.0°")
         # The second key press adds 5° to the last target, not to the measured angle of 4.98°.
+        fake.changes = {"goal_angle": fake.requests[-1]["angle"]}
+        page.shows("object angle 10.0°")
         page.type(b"\x1b[C")
         page.shows("✓ rotate to 15.0°")
+        fake.changes = {"goal_angle": fake.requests[-1]["angle"]}
+        page.shows("object angle 15.0°")
         page.type(b"\x1bOD")
         page.shows("✓ rotate to 10.0°")
         assert [r["command"] for r in fake.requests[-3:]] == ["rotate"] * 3

@@ -183,6 +183,26 @@ def test_a_time_range_is_replayed_at_the_original_rate(played, addresses, inline
     assert done.stdout.startswith(("20 of", "21 of"))
 
 
+def test_the_settings_are_published_before_a_later_part(tmp_path, inline, monkeypatch):
+    messages = [(schema.SETTINGS, sample(schema.SETTINGS) | {"timestamp": 1e9, "mono_ns": 10**11})]
+    for k in range(100):
+        times = {"timestamp": 1e9 + 0.01 * k, "mono_ns": 10**11 + k * 10**7}
+        messages.append((schema.STATE, sample(schema.STATE) | times | {"seq": k}))
+    write_recording(tmp_path / "a.mcap", messages)
+    sent: Messages = []
+    monkeypatch.setattr(replay, "Wire", SilentWire)
+    monkeypatch.setattr(SilentWire, "send", lambda _, *message: sent.append(message))
+    clock = SimpleNamespace(monotonic=lambda: SilentWire.waited)
+    monkeypatch.setattr(replay, "time", clock)
+    inline("replay", tmp_path / "a.mcap", "--no-wait", "--from", "0.5")
+    assert [topic for topic, _ in sent] == [schema.SETTINGS] + 50 * [schema.STATE]
+    assert sent[0][1]["again"] is True
+    assert SilentWire.waited == pytest.approx(0.49, abs=0.02)
+    sent.clear()
+    inline("replay", tmp_path / "a.mcap", "--no-wait", "--from", "0")
+    assert [message for _, message in sent] == [message for _, message in messages]
+
+
 class SilentWire:
     """Replace `Wire`: publish nothing, and count the time that the replay would wait."""
 

@@ -1,6 +1,7 @@
 """Test the pictures, the access control and the errors of ``softfinger view``."""
 
 import argparse
+import asyncio
 import base64
 import gzip
 import http.client
@@ -12,7 +13,7 @@ import threading
 import time
 import webbrowser
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from email.message import Message
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ import zmq
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from softfinger.daemon.client.command_client import NoAnswer
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.wire import schema
 from softfinger.daemon.wire.publisher import pack
@@ -34,11 +36,12 @@ from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.stop_condition import StopCondition
 from softfinger.tools.viewing import sources
 from softfinger.tools.viewing.document import save
-from softfinger.tools.viewing.page import listen
+from softfinger.tools.viewing.page import Site, listen
 from softfinger.tools.viewing.pictures import COLUMNS, TOPICS, Pictures, Row
 from softfinger.tools.viewing.sources import Playback, ViewError, follow
 from tests.conftest import until
-from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, state
+from tests.harness.fake_daemon import FakeDaemon, event, finger, frame, now, state
+from tests.harness.golden_wire import sample
 from tests.harness.recorded_hand import record_hand, write_recording
 from tests.harness.viewed import WAIT, Viewed, Watcher, masked, upgrade_request
 
@@ -234,6 +237,20 @@ def test_a_picture_has_the_values_of_the_stream() -> None:
     assert "0 messages could not be read" in said
 
 
+def test_the_true_object_disappears_with_the_simulated_hand() -> None:
+    kept = Kept()
+
+    def line_count(seq: int) -> int:
+        kept.pictures.take(schema.STATE, state(0.0, seq))
+        kept.pictures.draw()
+        return len(kept.newest["panels"]["hand"]["lines"])
+
+    without = line_count(5)
+    kept.pictures.take(schema.TRUTH, sample(schema.TRUTH) | now())
+    assert line_count(6) == without + 1
+    assert line_count(1) == without  # Another daemon, which controls real servos, was started.
+
+
 def test_images_of_tips_without_contact_are_blank() -> None:
     kept = Kept()
     noise = np.random.default_rng(1).normal(0.0, Settings().tactile.noise / 4.0, (44, 44))
@@ -357,7 +374,7 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
     grasp = {"command": "grasp", "force": 5.0, "client": "page 1"}
     with (
         FakeDaemon() as fake,
-        view(fake, "--timeout", "8") as viewed,
+        view(fake, "--timeout", "60") as viewed,
         Watcher(viewed.host) as page,
     ):
 
@@ -372,14 +389,28 @@ def test_a_command_is_sent_once_and_only_soon_after_its_picture() -> None:
         }
         assert press() == "✗ grasp: not accepted in mode disarmed; arm first"
         assert fake.requests == [grasp, grasp]
-        late = {"seen": page.next()["now"] - 8.0}
+        late = {"seen": page.next()["now"] - 60.0}
         assert ask(viewed.host, viewed.query, {**grasp, **late}).endswith("s behind")
         assert ask(viewed.host, viewed.query, grasp).startswith('✗ grasp: expected "seen"')
         for odd in (None, "grasp", [], {"seen": 1.0}, {**grasp, "seen": None}):
             assert ask(viewed.host, viewed.query, odd).startswith("✗ invalid command")
-        fake.close()
-        assert "✗ grasp: no reply" in press()
-        assert len(fake.requests) == 2
+        fake.replies["grasp"] = b"\xc1"
+        assert press().endswith("sent an invalid reply")
+        assert fake.requests == [grasp] * 3
+
+
+def test_a_reply_is_awaited_only_while_the_picture_is_recent() -> None:
+    timeouts: list[float] = []
+
+    def unanswered(_: dict[str, Any], timeout: float) -> dict[str, Any]:
+        timeouts.append(timeout)
+        raise NoAnswer("no reply")
+
+    with closing(asyncio.new_event_loop()) as loop:
+        site = Site(loop, "", unanswered, None, 1000.0, "")
+        asked = {"command": "grasp", "seen": time.monotonic() - 400.0}
+        assert site._answer(orjson.dumps(asked)) == "✗ grasp: no reply"
+    assert 0.0 < timeouts[0] <= 600.0
 
 
 def test_other_machines_need_a_one_time_code() -> None:
@@ -496,6 +527,12 @@ def test_a_recording_is_saved_as_a_moving_picture(recorded, tmp_path):
     assert len(lines) >= 6 + 5  # The lines show the fingers, tips, contacts, arrows and object.
 
 
+def test_a_long_recording_is_saved_with_a_valid_duration(recorded, tmp_path):
+    save(tmp_path / "run.svg", Recording(recorded), 3000.0, print)
+    # A duration in SVG has no exponent.
+    assert set(re.findall(r'dur="(.*?)"', (tmp_path / "run.svg").read_text())) == {"6000s"}
+
+
 def test_a_recording_that_cannot_be_saved_is_refused(recorded, tmp_path, inline):
     with pytest.raises(ViewError, match="pictures, expected at most 6000; choose a lower --rate"):
         save(tmp_path / "a.html", Recording(recorded), 1e-4, print)
@@ -525,6 +562,7 @@ def test_invalid_messages_are_tolerated() -> None:
     odd += [{**frame(0.0, 0), "data": b"abc"}, {**frame(0.0, 0), "pitch": -1.0}]
     odd += [{"timestamp": 1e9, "settings": "{", "request": "{", "command": "grasp", "ok": True}]
     odd += [{**state(0.0, 1), "mode": "\x1b[31m", "left": {**finger(0.0, 0), "q": 1e308}}]
+    odd += [{**state(0.0, 1), "left": {**finger(0.0, 0), "q": math.inf}}]
     kept = Kept(live=True)
     for topic in (*TOPICS, b"hand/news"):
         for message in odd:

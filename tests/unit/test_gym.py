@@ -135,6 +135,19 @@ def test_the_built_in_control_turns_and_holds_but_a_random_agent_does_not():
         law.close()
 
 
+def test_a_zero_action_keeps_the_initial_grip():
+    env = SoftFingerEnv("rotate")
+    env.reset(seed=1)
+    goals = list(env._loop.state.goal.q)
+    # The load bends the joints away from their goals.
+    assert np.abs(np.subtract(goals, env._loop.state.reading.q)).min() > 0.02
+    for _ in range(50):
+        env.step(np.zeros(2, np.float32))
+    assert env._loop.state.goal.q == pytest.approx(goals)
+    assert min(env._hand.force) > 7.0
+    env.close()
+
+
 def test_shaping_adds_the_increase_of_the_potential():
     plain, shaped = SoftFingerEnv("grasp"), SoftFingerEnv("grasp", shaped=True)
     sums = []
@@ -168,6 +181,19 @@ def test_the_baseline_closes_each_finger_based_on_its_own_features():
     assert free[0] == free[1] > 0.7
     assert pressed[0] < -0.4
     assert pressed[1] == free[1]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ('scene.fingers=["left"]', "scene.object_model=false"),
+        ("servos.backend=none",),
+        ("tactile.backend=none",),
+    ],
+)
+def test_a_hand_without_all_its_parts_is_refused(changes):
+    with pytest.raises(ValueError, match="expected two fingers, servos and tactile sensors"):
+        SoftFingerEnv("grasp", changes=changes)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -20,8 +21,9 @@ from rich.text import Text
 from softfinger.kinematics.estimation.invalid import Invalid
 from softfinger.tools.terminal import heatmap
 from softfinger.tools.terminal.heatmap import picture, resample
+from softfinger.tools.terminal.monitor import HandKeys
 from softfinger.tools.terminal.monitor_page import MonitorPage
-from softfinger.tools.terminal.stream_state import Commander, ShownReply, StreamState
+from softfinger.tools.terminal.stream_state import Commander, ShownReply, StreamState, judge
 from softfinger.tools.terminal.terminal import KeyDecoder
 from tests.conftest import until
 from tests.harness import fake_daemon
@@ -324,6 +326,30 @@ def test_row_0_is_at_the_bottom_and_column_0_on_the_left():
         "    ",
         "█   ",
     ]
+
+
+@pytest.mark.parametrize("label", ["", " "])
+def test_a_refusal_of_a_command_without_a_name_is_shown(label):
+    shown = judge(1.0, label, {"ok": False, "error": "found no command"})
+    assert shown.text.endswith("found no command")
+
+
+def test_a_turn_starts_at_the_goal_that_another_client_has_set():
+    feed, sent = fed(), []
+    commander: Any = SimpleNamespace(reply=None, send=lambda *_, **more: sent.append(more["angle"]))
+    keys = HandKeys(feed, commander)
+
+    def rotated(goal: float) -> None:
+        give(feed, b"hand/state", fake_daemon.state(1.0, 50) | {"goal_angle": math.radians(goal)})
+
+    rotated(5.0)
+    keys.press("right", 0.0)
+    keys.press("right", 0.1)  # The stream still contains the old goal.
+    rotated(14.98)
+    keys.press("right", 5.0)
+    rotated(-10.0)  # Another client has rotated the object.
+    keys.press("right", 10.0)
+    assert np.degrees(sent) == pytest.approx([9.98, 14.98, 19.98, -5.0])
 
 
 def test_a_stop_overtakes_and_discards_waiting_commands(tmp_path):

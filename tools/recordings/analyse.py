@@ -34,6 +34,7 @@ from softfinger.daemon.types import FINGERS, Frame, State
 from softfinger.daemon.wire import schema
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.tools.arguments import add_profile, profile, to_stderr
+from softfinger.tools.recordings.channels import channel_name
 from softfinger.tools.recordings.reader import Recording
 from softfinger.tools.recordings.recomputed import counts_of, recorded_models, recorded_settings
 from softfinger.tools.sweep import Progress, Sweep, add_sweep
@@ -161,6 +162,7 @@ OnProgress = Callable[[int], None]
 class Source:
     """Frames from all sensors in one file; ``frames(progress)`` yields (finger, t [s], counts).
 
+    The counts are None if a tare of the sensor began at this time.
     In a stream recording, ``t`` is relative to the first message. In files that contain only
     frames, ``t`` is relative to the first frame, and ``recording`` is set. At the end, ``progress``
     is called with ``total``. Kernels are loaded only when ``models`` is called, so that errors in
@@ -170,7 +172,7 @@ class Source:
     settings: Settings
     models: Callable[[], tuple[FingerModel, FingerModel]]
     total: int
-    frames: Callable[[OnProgress], Iterator[tuple[int, float, Counts]]]
+    frames: Callable[[OnProgress], Iterator[tuple[int, float, Counts | None]]]
     recording: FrameRecording | None = None
 
     @property
@@ -197,11 +199,19 @@ def _stream(path: Path, settings: Settings, own: bool) -> Source:
     models = partial(recorded_models, recording) if own else partial(_models_of, settings)
     if own:
         settings, _ = recorded_settings(recording)
+    channels = [channel_name(schema.TACTILE, {"finger": name}) for name in FINGERS]
+    recorded = [finger for finger, name in enumerate(channels) if name in recording.counts]
 
-    def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts]]:
-        for _, message in recording.messages([schema.TACTILE], progress=progress):
-            counts = counts_of(recording, message, settings)
-            yield FINGERS.index(message["finger"]), recording.time(message), counts
+    def frames(progress: OnProgress) -> Iterator[tuple[int, float, Counts | None]]:
+        wanted = (schema.TACTILE, schema.COMMAND)
+        for topic, message in recording.messages(wanted, progress=progress):
+            t = recording.time(message)
+            if topic == schema.TACTILE:
+                counts = counts_of(recording, message, settings)
+                yield FINGERS.index(message["finger"]), t, counts
+            elif message.get("command") == "tare" and message.get("ok") is True:
+                for finger in recorded:
+                    yield finger, t, None
 
     return Source(settings, models, recording.size, frames)
 
@@ -294,7 +304,10 @@ class _Pass:
         self._contact = self._state.contacts[finger]
         self._rows: list[tuple[float, ...]] = []
 
-    def add(self, t: float, counts: NDArray[np.uint16]) -> None:
+    def add(self, t: float, counts: Counts | None) -> None:
+        if counts is None:
+            self._perception.tare()
+            return
         self._sensor.frame = Frame(len(self._rows) + 1, t, t, True, counts)
         self._state.t = t
         self._perception.update(self._state)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections import deque
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,7 +110,8 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
             ):
                 pass
         began, first, newest = time.monotonic(), 0.0, math.inf
-        for topic, message in recording.messages(start=arguments.start, end=arguments.end):
+        selected = recording.messages(start=arguments.start, end=arguments.end)
+        for topic, message in chain(_earlier_settings(recording, arguments.start), selected):
             if message.get("again") is not True:  # Repeated messages are older than the recording.
                 # The system's Unix time may have been changed during the recording.
                 t = recording.time(message)
@@ -125,6 +129,14 @@ def _publish(arguments: argparse.Namespace, recording: Recording) -> None:
             wire.send(topic, message)
             sent += 1
     print(f"{sent} of {recording.total} messages published")
+
+
+def _earlier_settings(recording: Recording, start: float) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """Yield the newest settings before ``start`` [s], as a daemon repeats them to subscribers."""
+    if math.isfinite(start):
+        earlier = recording.messages([schema.SETTINGS], end=start - 1e-9)
+        for topic, message in deque(earlier, maxlen=1):
+            yield topic, message | {"again": True}
 
 
 def _recompute(arguments: argparse.Namespace, recording: Recording) -> int:

@@ -43,7 +43,8 @@ from softfinger.tools.terminal.terminal import KeyDecoder, Terminal, TerminalGon
 STEP_ANGLE = math.radians(5.0)  # object rotation per arrow-key press [rad]
 # Each pair contains the upper limit of a force range [N] and the force step in this range [N].
 _STEPS = ((1.0, 0.1), (5.0, 0.5), (math.inf, 1.0))
-_ACCUMULATION_TIME = 1.0  # time for which a new force replaces the force in the stream [s]
+# Time for which a new force or angle replaces the value in the stream [s].
+_ACCUMULATION_TIME = 1.0
 _CONFIRMATION_TIME = 3.0  # time limit for the second press of d, which confirms disarming [s]
 _COMMAND_KEYS = {"a": "arm", "r": "release", " ": "stop", "c": "clear", "d": "disarm", "w": "demo"}
 
@@ -55,6 +56,7 @@ class HandKeys:
         self._feed = feed
         self._commander = commander
         self._target: float | None = None  # object angle [rad]
+        self._turned = -math.inf  # time of the last turn
         self._chosen = math.nan  # grasp force [N]
         self._pressed = -math.inf  # time of the last force change made on this page
         self._asked = -math.inf  # time of the first press of d during a grip
@@ -118,15 +120,19 @@ class HandKeys:
             self._commander.send(now, label, "grasp", force=self._chosen)
 
     def _rotate(self, step: float, now: float) -> None:
-        """Rotate by one step from the last target angle, so that repeated key presses add up."""
-        reply, pose = self._commander.reply, self._feed.state.object
+        """Rotate by one step from the goal angle, so that repeated key presses add up."""
+        reply, state = self._commander.reply, self._feed.state
+        pose = state.object
         refused = reply is not None and not reply.ok
         if self._target is None or refused or self._feed.mode not in ("rotating", "holding"):
             self._target = pose.angle if pose.valid and math.isfinite(pose.angle) else None
             if self._target is None:
                 self._commander.refuse(now, "rotate: the object's angle is unknown")
                 return
+        elif now - self._turned > _ACCUMULATION_TIME and math.isfinite(state.goal_angle):
+            self._target = state.goal_angle  # Another client may have changed the goal.
         self._target += step
+        self._turned = now
         label = f"rotate to {math.degrees(self._target):.1f}°"
         self._commander.send(now, label, "rotate", angle=self._target)
 

@@ -371,5 +371,5 @@ def judge(now: float, label: str, record: Any) -> ShownReply:
             return ShownReply(now, False, f"{label}: {UNCONFIRMED_TEXT}")
         return ShownReply(now, True, f"{label}: ok")
     why = text(record, "error") or "invalid answer"
-    named = why.split(":")[0] == label.split()[0]  # True if the message names the command
+    named = why.split(":")[0] == label.split(" ")[0]  # True if the message names the command
     return ShownReply(now, False, why if named else f"{label}: {why}")

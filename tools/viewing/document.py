@@ -119,7 +119,7 @@ def _moving(scenes: list[tuple[str, list[str]]], period: float) -> str:
             place = places[colour] = places.get(colour, -1) + 1
             _, points = lines.setdefault((colour, place), (thick, len(shown) * [["0,0"]]))
             points[k] = _points(flat, left, top)
-    seconds = f"{period * len(shown):.3g}"
+    seconds = f"{period * len(shown):g}"
     wide, tall = f"{right - left:.0f}", f"{top - bottom:.0f}"
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" '

@@ -103,8 +103,10 @@ def held_outline(hand: HandGeometry, state: HandState, height: float) -> list[Fl
     if not state.object.valid or not all(map(touches, fingers)):
         return []
     q, d, theta = ([getattr(each, key) for each in fingers] for key in ("q", "d", "theta"))
-    a, tips = hand.tip_radius, hand.tips((q[0], q[1]))
     angle = 0.5 * (theta[0] + theta[1] - q[0] + q[1])
+    if not math.isfinite(angle):
+        return []
+    a, tips = hand.tip_radius, hand.tips((q[0], q[1]))
     n = np.array([math.cos(angle), math.sin(angle)])
     t = np.array([-n[1], n[0]])
     across = 0.5 * (tips[0] @ n + a - d[0] + tips[1] @ n - a + d[1])

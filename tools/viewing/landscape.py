@@ -64,7 +64,7 @@ def read_settings(message: dict[str, Any]) -> tuple[Settings, list[str]]:
         return Settings.model_validate_json(json.dumps(sections)), []
     except ValidationError as error:
         places = [[str(key) for key in each["loc"][:2]] for each in error.errors()]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         return Settings(), ["all of them"]
     for *section, key in filter(None, places):
         (sections.get(section[0], {}) if section else sections).pop(key, None)

@@ -180,6 +180,7 @@ class Pictures:
         if topic == schema.STATE:
             if number(message, "seq") < self.feed.state.seq:
                 self._begin_rows()  # The daemon was restarted.
+                self._truth = None
             elif self.states and self.time // STEP != stamp // STEP:
                 last = self.feed.state  # last state of the previous time step
                 self._past.append((last, Row(self._number, _packed(_row(self._number, last)))))
