@@ -88,7 +88,7 @@ class JointMotion:
         q, before, apart = reading.q, self._q, self._drift
         if longest < self._gap_time:
             limit = self._velocity_max * longest + _STEP_TOLERANCE
-            keep = 1.0 - dt / _DRIFT_TIME if longest < self._late_time else 0.0
+            keep = max(1.0 - dt / _DRIFT_TIME, 0.0) if longest < self._late_time else 0.0
             for i in self._fingers:
                 step = q[i] - before[i]
                 before[i] = q[i]
