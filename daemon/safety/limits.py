@@ -257,8 +257,11 @@ def _servos_silent(view: View, state: State, _: float) -> str:
     age = state.t - state.reading.t
     if age <= view.settings.servos.fault_after:
         return ""
-    lasted = "yet" if age == math.inf else f"for {age:.3f} s"
-    return f"servos: no valid reading {lasted}"
+    return f"servos: no valid reading {_lasted(age)}"
+
+
+def _lasted(age: float) -> str:
+    return "yet" if age == math.inf else f"for {age:.3f} s"
 
 
 @Limit("servos.silent",
@@ -622,7 +625,7 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
                 )
     return (
         _sensor_fault(view, state, i)
-        or f"tactile: no {what} from the {FINGERS[i]} sensor for {age:.3f} s{cure}"
+        or f"tactile: no {what} from the {FINGERS[i]} sensor {_lasted(age)}{cure}"
     )
 
 
