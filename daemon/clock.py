@@ -74,7 +74,7 @@ class Deadline:
         """Map the file at ``path``; ``create`` is `os.O_CREAT` or 0. Raises OSError."""
         file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | create, 0o600)
         try:
-            os.ftruncate(file, 8)
+            os.posix_fallocate(file, 0, 8)  # On a full disk, writing to a hole raises SIGBUS.
             self._value = memoryview(mmap.mmap(file, 8)).cast("d")
         finally:
             os.close(file)

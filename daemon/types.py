@@ -68,8 +68,9 @@ class Contact:
 
     seq: int = 0  # sequence number of the frame
     t: float = 0.0  # sample time of the frame [s]
-    t_arrival: float = 0.0  # arrival time of the frame [s]
-    t_valid: float = 0.0  # arrival time of the last frame with a valid estimate [s]
+    # Arrival times of the frame and of the last frame with a valid estimate, or -inf [s].
+    t_arrival: float = -math.inf
+    t_valid: float = -math.inf
     invalid: Invalid = Invalid.NO_FRAME  # reason why the estimate is invalid
     contact: bool = False  # True if the tip is in contact
     d: float = 0.0  # maximum displacement [m]

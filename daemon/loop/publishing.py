@@ -8,6 +8,8 @@ the messages; this module does not change the state.
 
 from __future__ import annotations
 
+import math
+
 from softfinger.daemon.loop.timing import Statistics
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
@@ -64,7 +66,7 @@ class Publishing:
         self._published = [-1, -1]  # `Frame.seq` // n of the last published frame, per finger
         self._states = 0  # number of published states
         # Time [s] and counts when the rates were last calculated.
-        self._counted: tuple[float, ...] = (0.0,) * 6
+        self._counted: tuple[float, ...] = (math.nan,) * 6
 
     def __call__(self, state: State) -> None:
         """Publish everything that is due on this tick."""
@@ -104,7 +106,10 @@ class Publishing:
         self._publisher.send(schema.TACTILE, frame, data, *sensor, wall, n, number)
 
     def _rates(self, state: State) -> Rates:
-        """Return the message rates [Hz] since the previous call, measured in machine time."""
+        """Return the message rates [Hz] since the previous call, measured in machine time.
+
+        The first call returns NaN.
+        """
         frames = [0, 0]
         for perception in self._perceptions:
             frames[perception.finger] = perception.frame_count
@@ -112,4 +117,4 @@ class Publishing:
         counted = t, state.seq, *frames, self._states, sum(self._numbers)
         last, self._counted = self._counted, counted
         dt, *counts = (now - before for now, before in zip(self._counted, last, strict=True))
-        return Rates(*(count / dt if dt > 0.0 else 0.0 for count in counts))
+        return Rates(*(count / dt for count in counts))

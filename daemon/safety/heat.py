@@ -30,6 +30,9 @@ from softfinger.kinematics.hand.servo_heat import (
 )
 
 _UPDATE_INTERVAL = 0.5  # time between thermal model updates [s]
+# Longest gap between two readings that is simulated [s]. After an hour, the temperatures have
+# settled, and simulating the hour takes about 10 ms.
+_GAP_MAX = 3600.0
 _AVERAGING_TIME = 5.0  # averaging time for the squared current [s]
 # Half the thermometer's resolution [°C]. A rounded reading may exceed the actual temperature by
 # half the resolution.
@@ -105,7 +108,7 @@ class HeatWatch:
                 continue  # No temperature has been read yet.
             # After a long gap between readings, use several steps that are short enough for the
             # winding's time constant.
-            for _ in range(max(round(passed / _UPDATE_INTERVAL), 1)):
+            for _ in range(max(round(min(passed, _GAP_MAX) / _UPDATE_INTERVAL), 1)):
                 step = min(passed, _UPDATE_INTERVAL)
                 follow(self._states[i].array, square, step, self._state.reading.temperature[i])
             heat, estimate = self._states[i], self._state.heat[i]

@@ -87,7 +87,7 @@ class JointMotion:
         q, before, apart = reading.q, self._q, self._drift
         if longest < self._gap_time:
             limit = self._velocity_max * longest + _STEP_TOLERANCE
-            keep = 1.0 - dt / _DRIFT_TIME if longest < self._late_time else 0.0
+            keep = max(1.0 - dt / _DRIFT_TIME, 0.0) if longest < self._late_time else 0.0
             for i in self._fingers:
                 step = q[i] - before[i]
                 before[i] = q[i]
@@ -256,8 +256,11 @@ def _servos_silent(view: View, state: State, _: float) -> str:
     age = state.t - state.reading.t
     if age <= view.settings.servos.fault_after:
         return ""
-    lasted = "yet" if age == math.inf else f"for {age:.3f} s"
-    return f"servos: no valid reading {lasted}"
+    return f"servos: no valid reading {_lasted(age)}"
+
+
+def _lasted(age: float) -> str:
+    return "yet" if age == math.inf else f"for {age:.3f} s"
 
 
 @Limit("servos.silent",
@@ -621,7 +624,7 @@ def _tactile_silent(view: View, state: State, _: float, i: int) -> str:
                 )
     return (
         _sensor_fault(view, state, i)
-        or f"tactile: no {what} from the {FINGERS[i]} sensor for {age:.3f} s{cure}"
+        or f"tactile: no {what} from the {FINGERS[i]} sensor {_lasted(age)}{cure}"
     )
 
 

@@ -41,6 +41,7 @@ LINE_FAULTS = (
     *_REPLY_FAULTS,
 )
 _DELAY_MAX = 1.0  # s
+_LOAD_MAX = 1e6  # N or N·m; the energies of far larger loads overflow
 _SERVO_FAILURES = ("overheat", "overload", "undervoltage", "stuck", "jump", "frozen", "refuse")
 SERVO_FAULTS = ("silent", "answer", "reboot", *_SERVO_FAILURES, "recover")
 BOARD_FAULTS = {  # default probability of each fault
@@ -149,7 +150,7 @@ _FORMS = (
     _Form(("delay",), "=SECONDS", (SERVOS,), bounds=(0.0, _DELAY_MAX)),
     _Form(MEASUREMENT_FAULTS, "=NUMBER", FINGERS, sided=True),
     # `push` is a force along the faces, away from the palm [N]. `twist` is a torque [N·m].
-    _Form(("push", "twist"), "=NUMBER", (OBJECT,)),
+    _Form(("push", "twist"), "=NUMBER", (OBJECT,), bounds=(-_LOAD_MAX, _LOAD_MAX)),
     _Form(_PORT_FAULTS, "", (SERVOS,), sided=True),
     _Form((WELL,), "", (ALL,), sided=True),
 )

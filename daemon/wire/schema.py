@@ -418,7 +418,7 @@ class Spread:
 
 @record
 class Rates:
-    """Rates over the last second, in ``hand/stats``."""
+    """Rates over the last second, in ``hand/stats``; NaN in the first message."""
 
     tick: float = _rates("Hz", "ticks")
     left: float = _rates("Hz", "tactile frames received from the left sensor")

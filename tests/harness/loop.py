@@ -11,6 +11,7 @@ from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.loop.publishing import parts
 from softfinger.daemon.types import Event, Frame
 from softfinger.daemon.wire.schema import STATE
+from softfinger.tools.simulated_daemon import SimulatedDaemon
 from tests.harness.golden_wire import message_maker
 
 Make = Callable[..., Daemon]
@@ -53,12 +54,26 @@ def torque_of(daemon: Daemon) -> Any:
     return daemon.hand.torque_on
 
 
-def advance_to(daemon: Daemon, mode: str, seconds: float) -> None:
+def run_until(
+    hand: Daemon | SimulatedDaemon,
+    condition: Callable[[], object],
+    seconds: float = 5.0,
+    step: float = 0.01,
+) -> None:
+    """Advance in steps of ``step`` [s] until ``condition`` is true.
+
+    Fail if this takes longer than ``seconds`` of virtual time.
+    """
+    for _ in range(round(seconds / step)):
+        if condition():
+            return
+        hand.loop.advance(step)
+    assert condition(), f"not within {seconds:g} s; the mode is {hand.loop.state.mode}"
+
+
+def advance_to(daemon: Daemon | SimulatedDaemon, mode: str, seconds: float) -> None:
     """Advance until the hand is in ``mode``; fail if this takes longer than ``seconds``."""
-    finish = daemon.clock.now() + seconds
-    while daemon.loop.state.mode != mode:
-        assert daemon.clock.now() < finish, f"mode is {daemon.loop.state.mode}, expected {mode}"
-        daemon.loop.advance(0.01)
+    run_until(daemon, lambda: daemon.loop.state.mode == mode, seconds)
 
 
 def armed(daemon: Daemon) -> Daemon:

@@ -3,7 +3,7 @@
 ``pytest --perturb SEED`` changes the following values by -1, 0 or 1 unit in the last place:
 
 - the results of elementary functions, sums and products from NumPy and `math`, in test modules and
-  in softfinger modules that contain no kernels;
+  in softfinger modules that define no function of a kernel;
 - the results of `numpy.linalg` in all modules;
 - the results of functions passed to `solve_ivp` and `curve_fit`;
 - the results of contact tables, closed forms, quadrature, material laws and pressure grids;
@@ -75,13 +75,18 @@ class Perturbation:
         self._wrap(importlib.import_module(_PLANT), "SimulatedHand.__init__", self._moving_plant)
 
     def enter_modules(self) -> None:
-        """Replace `np` and `math` in all imported modules that contain no kernels."""
+        """Replace `np` and `math` in all imported modules that define no function of a kernel."""
         own = {"np": self._own(np, _NUMPY), "math": self._own(math, _MATH)}
-        for name, module in list(sys.modules.items()):
-            names = vars(module)
-            kernels = [each for each in names.values() if isinstance(each, _KERNELS)]
-            own_kernels = any(each.py_func.__globals__ is names for each in kernels)
-            if name.startswith(("tests.", "softfinger.")) and not own_kernels:
+        named = ("tests.", "softfinger.")
+        modules = [vars(each) for name, each in sys.modules.items() if name.startswith(named)]
+        compiled = {
+            id(each.py_func.__globals__)
+            for names in modules
+            for each in names.values()
+            if isinstance(each, _KERNELS)
+        }
+        for names in modules:
+            if id(names) not in compiled:
                 names.update({key: own[key] for key in own if names.get(key) in (np, math)})
 
     def moved(self, value: Any) -> Any:

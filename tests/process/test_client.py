@@ -257,8 +257,7 @@ def test_a_cancelled_command_is_not_repeated(fake):
     async def cancelled() -> None:
         async with AsyncHand(fake.state_address, fake.command_address, timeout=60.0) as hand:
             arming = asyncio.create_task(hand.command("arm"))
-            while len(fake.requests) < 3:
-                await asyncio.sleep(0.01)
+            await asyncio.to_thread(until, lambda: len(fake.requests) >= 3)
             arming.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await arming

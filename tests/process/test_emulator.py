@@ -1,5 +1,6 @@
 """Test the process, ports, boards, scenes and faults of `softfinger emulate`."""
 
+import errno
 import os
 import signal
 import socket
@@ -187,6 +188,17 @@ def test_emulated_time_excludes_interruptions(monkeypatch, tmp_path):
     assert clock.now() == pytest.approx(0.06)
     now += 0.01
     assert clock.now() == pytest.approx(0.07)
+
+
+def test_a_full_disk_is_an_error_of_the_deadline_instead_of_a_crash(monkeypatch, tmp_path):
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    # A write to a mapped hole would end the process with SIGBUS, so the space is reserved.
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="No space left"):
+        Deadline(tmp_path / Deadline.NAME, os.O_CREAT)
+    assert Deadline.of(str(tmp_path / "servos")) is None
 
 
 @pytest.mark.parametrize("late", [0.0005, 0.004, 0.03, 5.0])

@@ -240,12 +240,13 @@ def test_the_key_identifies_a_client_and_clients_without_a_key_get_nothing(
 ):
     theirs = ask(others, addresses, stranger(folder, kind))
     ours = ask(others, addresses, load_client(folder / "alice"))
-    seen = 0
-    while seen < 200:  # Only the client with a key receives messages.
+
+    def received() -> bool:
         guarded.step()
-        if ours[0].poll(2):
-            ours[0].recv_multipart()
-            seen += 1
+        return bool(ours[0].poll(2)) and bool(ours[0].recv_multipart())
+
+    for _ in range(200):  # Only the client with a key receives messages.
+        until(received)
     until(lambda: guarded.step() or ours[1].poll(0))
     assert not theirs[0].poll(0)
     assert not theirs[1].poll(0)

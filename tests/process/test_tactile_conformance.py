@@ -112,10 +112,14 @@ def test_incomplete_and_noisy_frames_are_dropped_and_counted(backend, tmp_path):
     with Rig(backend, tmp_path, fault="torn=0.3") as rig:
         rig.sensor.open()
         seen: set[int] = set()
-        while len(seen) < 10 or rig.sensor.counters()["resyncs"] < 4:
+
+        def enough() -> bool:
             frame = rig.wait(lambda frame: frame.seq not in seen)
             seen.add(frame.seq)
             assert any(np.array_equal(frame.data, image(k)) for k in range(160))
+            return len(seen) >= 10 and rig.sensor.counters()["resyncs"] >= 4
+
+        until(enough)
         assert rig.sensor.counters()["skipped_bytes"] > 0
 
 

@@ -260,6 +260,8 @@ def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
             assert each.stdout is not None
             each.stdout.readline()  # The subscriber has received a state.
         while not file.exists() or not file.stat().st_size:
+            if recorder.poll() is not None:
+                raise RigError("the recorder has exited")
             rig.states()
         try:
             children = Path(f"/proc/{rig.daemon.pid}/task/{rig.daemon.pid}/children").read_text()

@@ -357,11 +357,14 @@ def test_a_setpoint_only_replaces_one_with_the_same_or_fewer_fields(context, ser
         stream.send_multipart([name, b"", msgpack.packb({"command": "hold", **numbers})])
     served.settle_until(lambda: len(served.link.asked) == 4)
     reasons = {}
-    while len(reasons) < 4:
-        served.serve(echo)
+
+    def answered() -> bool:
         while stream.poll(0):
             name, _, reply = stream.recv_multipart()
             reasons[name] = msgpack.unpackb(reply).get("reason")
+        return len(reasons) == 4
+
+    served.serve_until(echo, answered)
     superseded = dict.fromkeys((b"angle", b"both"), "superseded")
     assert reasons == {b"force": None, b"later": None, **superseded}
 

@@ -1,7 +1,6 @@
 """Test the parts of the controller, and the controller's performance on the simulated plant."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from softfinger.daemon.errors import Refused
 from softfinger.daemon.profile.load import load
 from softfinger.tools.benchmarks.rigs import SOLID
 from softfinger.tools.simulated_daemon import SimulatedDaemon, TrueStates
+from tests.harness.loop import run_until
 
 PAPER: dict[str, dict[str, Any]] = {
     "material": {"law": "constant"},
@@ -37,14 +37,6 @@ def grasped(hand: SimulatedDaemon, force: float = 10.0, seconds: float = 2.0) ->
     seen = hand.watch(seconds)
     start = int(np.flatnonzero((seen.force > 0.3).all(axis=1))[0])
     return TrueStates(seen.t[start:], seen.force[start:], seen.angle[start:], seen.slip[start:])
-
-
-def run_until(hand: SimulatedDaemon, condition: Callable[[], object]) -> None:
-    """Run until ``condition`` is true; fail if this takes longer than 5 s of virtual time."""
-    finish = hand.now + 5.0
-    while not condition():
-        assert hand.now < finish, f"mode {hand.mode}"
-        hand.run(0.01)
 
 
 def last_time(seen: TrueStates, off: NDArray[np.bool_]) -> float:

@@ -118,6 +118,7 @@ def test_a_held_object_slips_when_the_push_exceeds_friction(friction):
     push = 0.0
     while hand.object_pose[1] < place_held + 0.006:
         push += 0.01
+        assert push < 50.0, "the object does not slip"
         hand.apply_load(0.0, push)
         run(hand, 0.005)
         ratio = np.abs(hand.tangential) / hand.normal

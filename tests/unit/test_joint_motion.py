@@ -76,6 +76,14 @@ def test_a_velocity_without_motion_is_detected():
     assert seconds < 0.1
 
 
+def test_a_joint_that_stops_between_late_readings_of_a_slow_loop_does_not_jump():
+    motion, reading = JointMotion((0, 1), 6.0, 0.1), Reading(valid=True)
+    for t, q, dq in ((0.0, 0.0, 1.0), (0.1, 0.1, 1.0), (0.3, 0.25, 0.0)):
+        reading.t, reading.q[0], reading.dq[0] = t, q, dq
+        motion.update(t - 0.001, reading)
+        assert not motion.jumped
+
+
 @pytest.mark.parametrize("seconds", [0.03, 0.06, 0.2])
 def test_a_stall_while_a_joint_moves_is_not_a_jump(seconds):
     """Stall the loop before it sends a request, or before it receives the reply."""

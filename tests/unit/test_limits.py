@@ -13,7 +13,7 @@ from softfinger.daemon.profile.settings import SafetySettings as Limits
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.safety.limits import LIMITS, View
 from softfinger.daemon.tactile.replay import GivenFrames
-from softfinger.daemon.types import State
+from softfinger.daemon.types import Contact, State
 from softfinger.kinematics.estimation.estimator import ContactEstimate
 from softfinger.kinematics.estimation.invalid import Invalid
 from tests.harness.safety import (
@@ -65,7 +65,17 @@ FAULTS: dict[str, tuple[Changes, str, str]] = {
     "no estimates": (
         {"contacts.0.t_valid": OLD},
         "tactile.silent",
-        "no valid estimate from the left",
+        "no valid estimate from the left sensor for 0.1",
+    ),
+    "never an estimate": (
+        {"contacts.0": Contact(t_arrival=5.0)},
+        "tactile.silent",
+        "no valid estimate from the left sensor yet",
+    ),
+    "never a frame": (
+        {"contacts.1": Contact()},
+        "tactile.silent",
+        "no frame from the right sensor yet",
     ),
     "force": ({"contacts.1.force": 31.0}, "tip.force", "the right tip force is 31.0 N, above 30 N"),
     "depth": ({"contacts.1.d": 0.013}, "tip.displacement", "displacement is 13.00 mm, above 12"),

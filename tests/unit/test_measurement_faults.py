@@ -207,6 +207,7 @@ def test_faults_are_parsed():
         ("middle:torn", "'left:' or 'right:'"),
         ("push", "push, twist =NUMBER"),
         ("push=inf", "not a number"),
+        ("push=1e300", r"found 1e\+300, expected -1e\+06 to 1e\+06 \(number\)"),
         ("gain", "gain, shift-x, .* =NUMBER"),
         ("gain=-1", "0 to 100"),
         ("drift=1.5", "-1 to 1"),

@@ -70,6 +70,8 @@ def test_each_topic_is_published_on_every_nth_tick_or_frame():
 def test_rates_are_measured_over_the_last_second():
     stream = {"state_rate": 50.0, "tactile_rate": 20.0}
     listener, _ = listened(4.0, tactile={"rate": 80.0}, stream=stream)
+    # The first message has no earlier count.
+    assert math.isnan(listener.rates[0].tick)
     rates = listener.rates[-1]
     assert rates.tick == pytest.approx(500.0, abs=0.5)
     assert rates.left == pytest.approx(80.0, abs=1.01)

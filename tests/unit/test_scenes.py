@@ -9,7 +9,15 @@ from softfinger.daemon.errors import Refused
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.types import Event, Reading
-from tests.harness.loop import advance_to, command, grasped, heard, refusal, state_message
+from tests.harness.loop import (
+    advance_to,
+    command,
+    grasped,
+    heard,
+    refusal,
+    run_until,
+    state_message,
+)
 
 
 def holding_demo(daemon: Daemon) -> list[Event]:
@@ -86,8 +94,7 @@ def test_a_real_hand_whose_task_fails_follows_its_settings(make, action, mode):
     daemon.loop._task.restarts = False
     events = holding_demo(daemon)
     daemon.loop._task._end_mode = "moving"  # The hand never enters this mode.
-    while not events:
-        daemon.loop.advance(0.1)
+    run_until(daemon, lambda: events, 15.0)
     assert events[0] == ("warning", "task", "task ended: still holding after 10 s")
     assert daemon.loop.state.mode == mode
 

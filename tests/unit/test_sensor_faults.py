@@ -10,6 +10,7 @@ from softfinger.daemon.perception.hand_state import ANGLE, TAPER
 from softfinger.daemon.perception.perception import RepeatDetector
 from softfinger.tools.benchmarks.rigs import SOLID
 from softfinger.tools.simulated_daemon import SimulatedDaemon as Hand
+from tests.harness.loop import run_until
 from tests.unit.test_control import grasped
 
 FORCE = 6.0
@@ -89,8 +90,7 @@ def test_a_gain_change_at_one_solid_tip_is_named_and_has_no_effect(over):
 def test_a_tip_that_seems_to_let_go_is_not_a_sudden_load(kind, value, force):
     with Hand({}) as hand:
         hand.grasp(force)
-        while hand.mode != "holding":
-            hand.run(0.002)
+        run_until(hand, lambda: hand.mode == "holding", step=hand.loop.period)
         hand.plant.measurement_faults[1].begin(kind, value, hand.plant.t)
         seen = hand.watch(0.5)
         assert seen.force.max() < 1.4 * force
@@ -165,8 +165,7 @@ def test_a_recovered_sensor_is_used_again() -> None:
 def test_a_d_jump_without_motion_of_joints_and_the_other_tip_is_rejected() -> None:
     with Hand({}) as hand:
         hand.grasp(FORCE)
-        while hand.mode != "holding":
-            hand.run(0.002)
+        run_until(hand, lambda: hand.mode == "holding", step=hand.loop.period)
         zero = hand.plant.measurement_faults[1]
         zero.begin("drift", -0.05, hand.plant.t)
         seen = hand.watch(0.09)
@@ -259,8 +258,7 @@ def test_rejected_frames_are_forgotten_after_the_grip():
         grasped(hand, FORCE)
         faults, rejects = hand.plant.measurement_faults[1], hand.estimator.grasp.rejects_frames
         faults.begin("shift-x", 3.0, hand.plant.t)
-        while not rejects[1]:
-            hand.run(0.01)
+        run_until(hand, lambda: rejects[1])
         hand.run(0.5)
         assert hand.mode == "fault"
         faults.clear()

@@ -118,6 +118,23 @@ def test_a_failed_first_reading_does_not_change_the_prediction():
     assert told < TIME_MAX
 
 
+def test_a_gap_of_weeks_between_readings_does_not_occupy_a_tick(monkeypatch):
+    steps: list[float] = []
+
+    def counted(array: Any, square: float, dt: float, sensed: float) -> None:
+        steps.append(dt)
+        follow(array, square, dt, sensed)
+
+    monkeypatch.setattr("softfinger.daemon.safety.heat.follow", counted)
+    bench = Bench(0)
+    bench.step(0.0)
+    bench.t += 14.0 * 86_400.0  # The servos had no supply.
+    bench.plant.warm(20.0)
+    bench.step(0.0)
+    assert len(steps) < 20_000
+    assert bench.state.heat[0].case == pytest.approx(20.0, abs=1.0)
+
+
 def test_half_of_the_lasting_current_causes_no_warning():
     assert least_at_half_load(1, 1800.0) > 600.0
 

@@ -23,6 +23,7 @@ from softfinger.daemon.clock import VirtualClock
 from softfinger.daemon.errors import Reason, Refused
 from softfinger.daemon.gateway import bounds, commands
 from softfinger.daemon.gateway.commands import CommandEndpoint
+from tests.conftest import until
 from tests.harness.gateway import Served
 
 action = st.one_of(
@@ -142,8 +143,7 @@ def test_a_backlog_that_libzmq_delivers_slowly_is_cancelled_by_a_stop():
         for _ in range(500):
             for client in range(20):
                 scene.ask(client, command="arm", force=1.0)
-            while scene.arrived:
-                scene.act("gateway")
+            until(lambda: scene.act("gateway") or not scene.arrived)
             scene.act("loop")
         for _ in range(3):
             scene.act("time")
@@ -170,6 +170,5 @@ def test_a_flood_does_not_count_as_old_forever():
             scene.ask(0, command="status")
         scene.act("gateway")
         assert door._dated < math.inf
-        while len(scene.arrived) > 70:
-            scene.act("gateway")
+        until(lambda: scene.act("gateway") or len(scene.arrived) <= 70)
         assert door._dated == math.inf

@@ -15,7 +15,7 @@ from softfinger.daemon.safety.wiring import WiringWatch
 from softfinger.daemon.servos.simulated import SimulatedServos
 from softfinger.daemon.types import State
 from softfinger.kinematics.estimation.invalid import Invalid
-from tests.harness.loop import armed, command, heard
+from tests.harness.loop import armed, command, heard, run_until
 
 # Signs and offsets [rad] of the readings of both joints.
 JOINTS = {
@@ -175,8 +175,7 @@ def test_fingers_that_open_are_reported_before_they_reach_their_stop(make, wirin
     daemon = make(wiring, **simulation)
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q.min() > -0.54:  # The joint's stop is at -0.55 rad.
-        daemon.loop.advance(0.02)
+    run_until(daemon, lambda: daemon.hand.q.min() < -0.54)  # The joint's stop is at -0.55 rad.
     (text,) = texts(events, "joint.opens")
     assert "neither tip has contact: if a finger opens" in text
 
@@ -204,8 +203,7 @@ def test_fingers_that_stand_in_the_approach_are_reported(make):
     daemon = make("reversed")
     events = heard(daemon)
     command(daemon, "grasp", force=6.0)
-    while daemon.hand.q[0] > -0.54:  # Wait for the joint to reach its stop.
-        daemon.loop.advance(0.02)
+    run_until(daemon, lambda: daemon.hand.q[0] < -0.54)  # Wait for the joint to reach its stop.
     daemon.loop.advance(1.0)
     (told,) = [text for level, kind, text in events if kind == "joint.blocked"]
     assert told.startswith("the left joint has stopped at 3")
