@@ -119,11 +119,11 @@ class Refused(SoftfingerError):
 
 
 class NoStream(SoftfingerError):
-    """No stream message arrived before the timeout. The error text names the address."""
+    """A wait for a stream message timed out. The error text names the address."""
 
 
 class NotInTime(SoftfingerError, TimeoutError):
-    """No state met the condition before the timeout. The error text contains the last state."""
+    """A wait for a condition timed out. The error text contains the last state."""
 
 
 class HandClosed(SoftfingerError):

@@ -29,7 +29,7 @@ class GraspState(Record):
     normal: Pair  # normal forces [N]
     shear: float  # ratio of shear force to normal force, at equilibrium without a load
     angle_std: float  # standard deviation of the object angle [rad]
-    tilt_moment_ratio: float  # (∂U/∂θ)/(F θ d), a constant for an upright tip
+    tilt_moment_ratio: float  # (∂U/∂θ)/(F θ d) near θ = 0; springs: 2/3, solid rubber: about 0
 
     # Moment arms
     moment_arm: Pair  # ∂(d1 + d2)/∂q [m]

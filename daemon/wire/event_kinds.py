@@ -103,8 +103,8 @@ KINDS: dict[str, EventKind] = {
     ),
     "slip": EventKind(
         "warning",
-        "The object slips or rotates in the grip. The event also reports that the daemon increased "
-        "the grip force or stopped a rotation to prevent slip.",
+        "The object slips or rotates in the grip, or the daemon increased the grip force or "
+        "stopped a rotation to prevent slip.",
         "Grasp with more force; check `control.tip_friction` and `control.object_load`.",
     ),
     "grip.slip": EventKind(

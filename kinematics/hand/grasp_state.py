@@ -89,11 +89,12 @@ def held_motion(
         arm_i = ±v_i·n/cos(α/2) − tan(α/2) (a − d_i)
         slide = (O1 − O2)·t/cos(α/2) + tan(α/2) (d1 − d2)
 
-    where n and t belong to the bisector's ``angle`` φ, and α is the ``taper`` [rad]. The object
-    moves along t as the tips roll and approach each other. For parallel faces, arm_i and b_i [m]
-    are the moment arms of the normal force and of the shear force about the pivot. In a symmetric
-    grasp, r1 + r2 equals 2 (a − d + L sin q + e cos q)/W. ``across`` is W = d1 + d2 − 2a + (O2 −
-    O1)·n/cos(α/2) [m]. The distance between the contacts along n is ``width`` = W cos(α/2).
+    where n and t are the normal and the tangent of the bisector at the ``angle`` φ, and α is the
+    ``taper`` [rad]. The object moves along t as the tips roll and approach each other. For parallel
+    faces, arm_i and b_i [m] are the moment arms of the normal force and of the shear force about
+    the pivot. In a symmetric grasp, r1 + r2 equals 2 (a − d + L sin q + e cos q)/W. ``across`` is W
+    = d1 + d2 − 2a + (O2 − O1)·n/cos(α/2) [m]. The distance between the contacts along n is
+    ``width`` = W cos(α/2).
 
     W is clamped to at least half the tip radius, because the rotation and the shear forces would
     diverge for thinner objects. In reality, inertia and the shear compliance of the tips slow the

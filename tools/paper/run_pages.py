@@ -80,9 +80,9 @@ def run_compression(tilt: float) -> dict[str, FloatArray]:
 
 
 def run_rotation() -> dict[str, FloatArray]:
-    """Starting at first touch, rotate the finger by 11.5° about its root against a fixed object.
+    """Rotate the finger by 11.5° about its joint axis, from first touch, against a fixed object.
 
-    The tip's distance from the root is chosen so that d reaches 4 mm. The servo moves the joint.
+    The tip's distance from the axis is chosen so that d reaches 4 mm. The servo moves the joint.
     Between frames, d and θ are predicted from the joint angle.
     """
     length = _ROOT_DEPTH / math.sin(TILTED)
@@ -186,7 +186,7 @@ def _columns(
 
 
 def roll(hand: SimulatedHand, d: float, angle: float, rolling: float = 1.0) -> None:
-    """Move the object as if it had rolled to ``angle`` [rad] at constant ``d`` [m].
+    """Place the object as if it had rolled to ``angle`` [rad] at constant ``d`` [m].
 
     The fraction ``rolling`` of the face motion is pure rolling; the remainder shears the tip.
     """
@@ -339,9 +339,9 @@ PAGES = {
         rows=2,
         notes=(
             "The plant presses the object on the tip at 2 mm/s; 44 × 44 cells on 58 mm, 25 "
-            "frames per second, noise of 0.5 % of E in each cell. Errors are shown from 1 mm on, "
-            "each point from one frame. Plant and estimator use the same model, so the paper's "
-            "constant offset, which comes from the material, does not appear.",
+            "frames per second, noise of 0.5 % of E in each cell. Errors are shown from 1 mm on. "
+            "Each point is the estimate from one frame. Plant and estimator use the same model, so "
+            "the paper's constant offset, which comes from the material, does not appear.",
         ),
     ),
     "fig10_run": FigurePage(
@@ -363,8 +363,8 @@ PAGES = {
             "Angles have the paper's sign. Rotation: the servo turns the finger about a root "
             "20.1 mm from the tip's centre, so d increases from 0 to 4 mm; between frames, the "
             "daemon extrapolates its estimates from the joint motion. Rolling: d is constant, and "
-            "each estimate uses one frame. Grey: model. The minimum is that of a parabola fitted "
-            "to the estimates, ± standard error.",
+            "each estimate uses one frame. Grey: model. The minimum is the minimum of a parabola "
+            "fitted to the estimates, ± its standard error.",
         ),
     ),
 }  # fmt: skip
