@@ -307,8 +307,9 @@ class Converter:
 
     @property
     def quantum(self) -> float:
-        """Mean slope of the calibration curve [Pa per count]."""
-        return self.saturation / self._full
+        """Mean slope of the calibration curve [Pa per count], from zero offset to saturation."""
+        counts = np.maximum(self._full - self.zero, 0.0)[self.live]
+        return float(self._ends()[self.live].sum() / max(counts.sum(), 1.0))
 
 
 def least_end(ends: FloatArray) -> float:
