@@ -167,6 +167,15 @@ def daemon_settings(folder, recording, **tactile) -> Settings:
     return Settings.model_validate(raw)
 
 
+def test_a_recording_of_an_unloaded_tip_may_contain_its_true_d(tmp_path):
+    (tmp_path / "profile.toml").write_text(PROFILE)
+    np.savez(tmp_path / "rest.npz", frames=MadeUp().counts(np.zeros((N, N)), 9), d=np.zeros(9))
+    given = ["--config", str(tmp_path / "profile.toml"), "--no-plot"]
+    words = ["calibrate", "tare", str(tmp_path / "a.json"), *given]
+    assert main([*words, "--recording", str(tmp_path / "rest.npz")]) == 0
+    assert load_calibration(tmp_path / "a.json").tare.frames == 9
+
+
 def test_the_daemon_applies_the_file(bench, tmp_path):
     folder, sensor = bench
     path = tmp_path / "held.npz"
@@ -341,6 +350,14 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
             "curve",
             {"frames": SATURATED, "words": ["--force", "1"]},
             "curve: load 1 saturates a cell",
+        ),
+        (
+            "tare",
+            {
+                "frames": np.concatenate([MadeUp().press(d, frames=5) for d in (0, 0.004)]),
+                "d": np.repeat([0.0, 0.004], 5),
+            },
+            "tare: the readings of ",
         ),
         (
             "law",

@@ -55,7 +55,8 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
     if arguments.recording:
         runs = [_read(path, settings.tactile, sensor) for path in arguments.recording]
         whole = runs[0]
-        if len(runs) == 1 and whole.truths and arguments.step != "relaxation":
+        by_frame = arguments.step not in ("tare", "equilibrate", "relaxation")
+        if len(runs) == 1 and whole.truths and by_frame:
             # If one recording contains the whole run, each frame with a contact is a separate load.
             truths = whole.truths | _spread(given, len(whole.t))
             used = truths["d"] > 0.0 if "d" in truths else np.ones(len(whole.t), bool)
