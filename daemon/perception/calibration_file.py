@@ -340,6 +340,8 @@ def _contradiction(calibration: Calibration) -> str:
         return "tare.correlation: expected rows of equal length whose first number is 1"
     if calibration.equilibrate and not any(map(any, calibration.equilibrate.gain)):
         return "equilibrate.gain: found only dead cells (gain 0), expected at least one live cell"
+    if not Converter(calibration.model_copy(update={"curve": None}), 1.0).saturation > 0.0:
+        return f"tare.zero: most cells are saturated at {sensor.full_count} counts without a load"
     if calibration.curve:
         converter = Converter(Calibration(sensor=sensor, date="", curve=calibration.curve), 1.0)
         pressures = converter.pressure(np.arange(sensor.full_count + 1.0))

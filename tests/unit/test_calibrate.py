@@ -293,6 +293,10 @@ def test_a_gain_that_no_grip_has_measured_is_refused(tmp_path, capsys, monkeypat
         (lambda c: c["tare"]["zero"][3].__setitem__(4, -1.0), "expected numbers ≥ 0"),
         (lambda c: c["tare"]["zero"][3].__setitem__(4, float("nan")), "tare"),
         (
+            lambda c: c["tare"].update(zero=[[4095.0] * N] * N),
+            "tare.zero: most cells are saturated",
+        ),
+        (
             lambda c: c["curve"].update(coefficients=[1.0, 5.0, -1.0, 0.0]),
             "must increase",
         ),
@@ -359,6 +363,7 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
             },
             "tare: the readings of ",
         ),
+        ("tare", {"frames": np.full((9, N, N), 4095, np.uint16)}, "tare: most cells are saturated"),
         (
             "law",
             {"frames": np.zeros((3, N, N), np.uint16), "d": [0.002, 0.004, 0.006]},

@@ -181,7 +181,12 @@ def _tare(step: Step) -> Done:
     noise = float(np.median(found.noise))
     count = sum(map(len, step.loads.frames))
     rho = found.correlation
-    result = _kept(TareStep, found, noise=noise, frames=count)
+    calibration = step.result(tare=_kept(TareStep, found, noise=noise, frames=count))
+    if not Converter(calibration, step.settings.tactile.pascal_per_count).saturation > 0.0:
+        raise CalibrationError(
+            "tare: most cells are saturated, expected an unloaded tip; check the sensor and "
+            "tactile.full_count"
+        )
     line = (
         f"{count} frames, zero offset up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
     )
@@ -191,7 +196,7 @@ def _tare(step: Step) -> Done:
     if found.drift > 0.0:
         line += f", common drift of all cells {found.drift:.2f} counts"
     spread = Map("noise, standard deviation [counts]", found.noise)
-    return step.result(tare=result), line, (Map("zero [counts]", found.zero), spread)
+    return calibration, line, (Map("zero [counts]", found.zero), spread)
 
 
 def _refuse_saturation(step: Step) -> None:
