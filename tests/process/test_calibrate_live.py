@@ -110,13 +110,15 @@ def test_relaxation_is_zero_for_a_tip_without_relaxation(live):
     assert "written to" not in said
 
 
-def test_missing_loads_change_nothing(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("step", ["centre --theta 0 5", "centre", "equilibrate", "relaxation"])
+def test_missing_loads_change_nothing(step, tmp_path, capsys, monkeypatch):
     profile = tmp_path / "press.toml"
     profile.write_text(PROFILE.replace('clock = "virtual"', 'clock = "real"'))
     monkeypatch.setattr(sys, "stdin", type("Ended", (), {"readline": lambda _: ""})())
     monkeypatch.setattr(calibration_frames, "RealClock", VirtualClock)
     file = tmp_path / "a.json"
-    words = ["calibrate", "centre", str(file), "--theta", "0", "5", "--config", str(profile)]
+    name, *words = step.split()
+    words = ["calibrate", name, str(file), *words, "--config", str(profile)]
     assert main([*words, "--no-plot", "--frames", "8"]) == 1
     assert "ended before all loads were applied" in capsys.readouterr().err
     assert not file.exists()

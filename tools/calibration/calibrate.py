@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--frames", type=_frames, default=64, help="number of live frames per load (default 64)"
     )
     parser.add_argument(
-        "--loads", type=int, default=0, help="equilibrate, live: number of pressures"
+        "--loads", type=int, default=1, help="equilibrate, live: number of pressures (default 1)"
     )
     for name, unit in (("force", "N"), ("d", "mm"), ("theta", "degrees")):
         parser.add_argument(

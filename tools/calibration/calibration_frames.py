@@ -115,10 +115,10 @@ def _live(
     loads = []
     with _opened(settings, clock, finger) as backend:
         for k in range(count):
-            if count > 1 or truths:
+            if arguments.step != "tare":
                 load = {name: values[k] / _UNITS[name] for name, values in truths.items()}
                 words = ", ".join(f"{name} {value:g}" for name, value in load.items())
-                told = f"apply load {k + 1} of {count}: {words or 'uniform pressure'}"
+                told = f"apply load {k + 1} of {count}{f': {words}' * bool(words)}"
                 if arguments.step == "relaxation":
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
