@@ -3,6 +3,7 @@
 import contextlib
 import io
 import math
+import signal
 import sys
 
 import numpy as np
@@ -122,6 +123,25 @@ def test_missing_loads_change_nothing(step, tmp_path, capsys, monkeypatch):
     assert main([*words, "--no-plot", "--frames", "8"]) == 1
     assert "ended before all loads were applied" in capsys.readouterr().err
     assert not file.exists()
+
+
+@pytest.mark.parametrize("step", ["centre", "relaxation"])
+def test_ctrl_c_ends_the_wait_for_a_load(step, tmp_path, monkeypatch):
+    is_waiting = []
+
+    class Terminal:
+        def readline(self) -> str:
+            signal.raise_signal(signal.SIGINT)
+            is_waiting.append(True)
+            return ""
+
+    profile = tmp_path / "press.toml"
+    profile.write_text(PROFILE.replace('clock = "virtual"', 'clock = "real"'))
+    monkeypatch.setattr(sys, "stdin", Terminal())
+    monkeypatch.setattr(calibration_frames, "RealClock", VirtualClock)
+    words = ["calibrate", step, str(tmp_path / "a.json"), "--config", str(profile)]
+    assert main(words) == 130
+    assert not is_waiting
 
 
 def test_the_end_of_a_replay_is_reported(tmp_path, capsys, monkeypatch):

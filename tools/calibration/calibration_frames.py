@@ -8,6 +8,7 @@ import math
 import shlex
 import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -140,11 +141,20 @@ def _while_pressed(
     """Return the last frames before a load is applied, and ``--frames`` frames under the load."""
     before: deque[Frame] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock)
-    with ThreadPoolExecutor(1) as pool:
-        brought = pool.submit(bring, arguments, told, load=1, **load)
-        while not brought.done():
+    is_applied = threading.Event()
+
+    def collect() -> None:
+        while not is_applied.is_set():
             before.append(next(frames))
-        brought.result()
+
+    with ThreadPoolExecutor(1) as pool:
+        collected = pool.submit(collect)
+        try:
+            # Ctrl-C interrupts only the main thread, so this thread waits for Enter.
+            bring(arguments, told, load=1, **load)
+        finally:
+            is_applied.set()
+        collected.result()
     return [*before, *(next(frames) for _ in range(arguments.frames))]
 
 
