@@ -47,6 +47,7 @@ from softfinger.kinematics.calibration.press_fit import (
     TipFit,
     Trend,
     compare_tips,
+    covers,
     first_cycle,
     fit_centre,
     fit_modulus,
@@ -287,7 +288,7 @@ def _modulus(step: Step) -> Done:
     result = _kept(ModulusStep, found)
     d, theta, force = d[whole], theta[whole], force[whole]
     table = ContactTable.build(tip, Material.constant(found.modulus))
-    model = table(d - found.offset, theta).force
+    model = table(d - found.offset, theta, edge=True).force
     shown = Points("constant E", "d [mm]", "F [N]", d * 1e3, force, model)
     alone = found.trend.modulus / 1e6
     each = Points("E of each load", "d [mm]", "E [MPa]", found.trend.d * 1e3, alone)
@@ -327,6 +328,8 @@ def _law(step: Step) -> Done:
     if best.trend is not None:
         lines.append(_over_d(best.trend))
     lines += [_told(each) for each in fits[1:]]
+    if not covers(Fingertip(settings.tip.radius, "solid"), d, theta).all():
+        lines.append("solid: not compared: a press exceeds the depth or tilt range of the data")
     steps: dict[str, Any] = {"scales": None}
     wants = tip_settings(best.tip)
     if best.valid > 0.0:
