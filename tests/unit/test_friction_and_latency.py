@@ -99,6 +99,14 @@ def test_torque_independent_of_direction_is_not_friction():
         fit_friction([], [], [], [], 0.010, COUNT)
 
 
+def test_a_joint_that_settles_without_its_goal_did_not_break_away():
+    # A person moves the joint and lets go: the joint creeps by 3 mrad, and the goal never moves.
+    moved = 0.5 * np.abs(np.arange(0.0, 6.0, 0.01) % 2.0 - 1.0)
+    q = np.concatenate([moved, np.full(100, 0.5), np.linspace(0.5, 0.503, 4), np.full(100, 0.503)])
+    fit = fit_friction(0.01 * np.arange(q.size), q, np.zeros(q.size), 0.1 - 0.2 * q, 0.01, COUNT)
+    assert math.isnan(fit.stiction)
+
+
 def test_only_motion_without_contact_is_used(tmp_path, capsys):
     due: Due = {
         100: {"command": "arm"},
