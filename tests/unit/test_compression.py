@@ -260,6 +260,7 @@ def test_file_formats_of_testing_machines_are_read(tmp_path, capsys, header, for
         ("d [mm],F [N]", "1,2\n1.1", "line 3: force: found '', expected a number"),
         ('"d\n[mm]",F [N]', "1,2", "'d': found the unit 'mm]\"', expected one of mm"),
         ("strain [kPa],stress [kPa]", "1,2", "'strain [kPa]': found the unit 'kPa'"),
+        ("d [mm],F [N]", f'1,"{200_000 * "2"}', "field larger than field limit (131072): check"),
     ],
 )
 def test_an_unreadable_file_is_rejected_and_nothing_is_written(tmp_path, capsys, header, row, told):

@@ -105,6 +105,7 @@ def test_a_single_frame_needs_no_frame_line():
         ("7,255,1\n", "", "frame 4 has 1 of 2 rows"),
         ("3,4,5\n", "", "the file ends within frame 6, which has 1 of 2 rows"),
         ("3,4,5\n", "3,4,5\n6,7,8\n", "line 22"),
+        ("3,4,5\n", f'3,4,"{200_000 * "5"}\n', "found '3,4,\"5555.*check the quotation marks"),
     ],
 )
 def test_files_that_are_not_exports_are_reported(old, new, told):
