@@ -126,6 +126,9 @@ def test_an_export_is_read_as_a_recording(tmp_path):
         path.write_text(EXPORT.replace("7,255,1", f"7,{value},1"))
         with pytest.raises(RecordingError, match=f"row 2, cell 2 .* is {value}, expected"):
             read_frames(path, 4.0, 100.0)
+    path.write_text(EXPORT.replace("7,255,1", "7,70000,1"))
+    with pytest.raises(RecordingError, match=r"is 70000, expected at most 65535 counts$"):
+        read_frames(path, 4.0, 100.0)
     path.write_text("nothing")
     with pytest.raises(
         RecordingError, match=r"run\.asf: the file does not contain an ASCII_DATA line"
