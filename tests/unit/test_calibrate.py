@@ -176,6 +176,16 @@ def test_a_recording_of_an_unloaded_tip_may_contain_its_true_d(tmp_path):
     assert load_calibration(tmp_path / "a.json").tare.frames == 9
 
 
+def test_a_result_is_told_if_its_plot_cannot_be_written(bench, tmp_path, capsys):
+    folder, _ = bench
+    (tmp_path / "a.tare.png").mkdir()
+    words = ["--config", str(folder / "profile.toml"), "--recording", str(folder / "rest.npz")]
+    assert main(["calibrate", "tare", str(tmp_path / "a.json"), *words]) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("tare: 200 frames")
+    assert "the result was not plotted: [Errno 21] Is a directory: " in told.err
+
+
 def test_the_daemon_applies_the_file(bench, tmp_path):
     folder, sensor = bench
     path = tmp_path / "held.npz"

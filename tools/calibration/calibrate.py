@@ -184,7 +184,7 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
     if panels and not arguments.no_plot:
         try:
             draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))
-        except MissingExtra as error:
+        except (MissingExtra, OSError) as error:
             print(f"calibrate: the result was not plotted: {error}", file=sys.stderr)
     return line
 
