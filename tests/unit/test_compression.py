@@ -209,6 +209,13 @@ def test_a_run_that_starts_in_contact_is_rejected():
         fit_compression([run], Fingertip(A), UNIT)
 
 
+def test_a_fit_in_which_the_tip_hardly_touches_is_rejected():
+    d = np.linspace(0.0, 7e-3, 12)
+    run = loading(d, math.pi * E * d**1.5)
+    with pytest.raises(CalibrationError, match="must include the onset of contact"):
+        fit_compression([run], Fingertip(A, "solid"), UNIT)
+
+
 def written(path: Path, header: str, rows: list[str]) -> Path:
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return path
