@@ -125,6 +125,13 @@ def test_missing_loads_change_nothing(step, tmp_path, capsys, monkeypatch):
     assert not file.exists()
 
 
+def test_a_missing_folder_is_reported_before_the_first_load(tmp_path, capsys):
+    (tmp_path / "press.toml").write_text(PROFILE)
+    words = ["calibrate", "centre", str(tmp_path / "no" / "a.json"), "--move", "true"]
+    assert main([*words, "--config", str(tmp_path / "press.toml")]) == 1
+    assert capsys.readouterr().err == f"calibrate: {tmp_path / 'no'}: No such file or directory\n"
+
+
 @pytest.mark.parametrize("step", ["centre", "relaxation"])
 def test_ctrl_c_ends_the_wait_for_a_load(step, tmp_path, monkeypatch):
     is_waiting = []

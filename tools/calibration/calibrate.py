@@ -135,6 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CalibrationError(
             f"--compression: found the `{step}` step, but only the `law` step uses this option"
         )
+    arguments.file.parent.stat()  # Report a missing folder before the user applies any loads.
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)
