@@ -206,6 +206,19 @@ def covers(tip: Fingertip, d: FloatArray, theta: FloatArray) -> NDArray[np.bool_
     return np.asarray(inside, np.bool_)
 
 
+def require_covered(
+    step: str, tip: Fingertip, d: FloatArray, theta: FloatArray, offset: float = 0.0
+) -> None:
+    """Raise CalibrationError if the tip's contact table does not cover all contacts."""
+    inside = covers(tip, d - offset, theta)
+    if not inside.all():
+        k = int(np.argmin(inside))
+        raise CalibrationError(
+            f"{step}: d = {d[k] * 1e3:g} mm at θ = {math.degrees(theta[k]):.3g}° is outside the "
+            f"range of the model (tip.physics = {tip.physics}): reduce d or θ"
+        )
+
+
 def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
     def at(poisson: float) -> TipFit:
         return fit_tip(presses, replace(tip, poisson=poisson), grid)
@@ -293,13 +306,7 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
         offset += step
         if abs(step) < 1e-9:
             break
-    inside = covers(tip, depth - offset, tilt)
-    if not inside.all():
-        k = int(np.argmin(inside))
-        raise CalibrationError(
-            f"modulus: d = {depth[k] * 1e3:g} mm at θ = {math.degrees(tilt[k]):.3g}° is outside "
-            f"the range of the model (tip.physics = {tip.physics}): reduce d or θ"
-        )
+    require_covered("modulus", tip, depth, tilt, offset)
     fitted = modulus * unit(np.maximum(depth - offset, 1e-9), tilt).force
     errors = fitted / load - 1.0
     alone = trend(depth, modulus / (1.0 + errors), load, tip.physics)

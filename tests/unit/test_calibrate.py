@@ -359,6 +359,14 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
             {"d": [0.002, 0.004], "words": ["--force", "1", "2", "3"]},
             "--force: found 3 values for 2 loads",
         ),
+        (
+            "curve",
+            {
+                "d": [0.004, 0.009],
+                "words": ["--set", "tip.physics=solid", "--set", "safety.d_max=0.008"],
+            },
+            "curve: d = 9 mm at θ = 0° is outside the range of the model (tip.physics = solid)",
+        ),
         ("equilibrate", {"frames": SATURATED}, "equilibrate: load 1 saturates a cell"),
         (
             "curve",

@@ -51,6 +51,7 @@ from softfinger.kinematics.calibration.press_fit import (
     first_cycle,
     fit_centre,
     fit_modulus,
+    require_covered,
 )
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -232,6 +233,7 @@ def _curve(step: Step) -> Done:
             )
         # Use the profile's material to compute the force on the whole footprint.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
+        require_covered("curve", tip, d, step.theta)
         pressures = [
             step.plain_grid.pressure(tip, material, float(x), float(theta))
             for x, theta in zip(d, step.theta, strict=True)
