@@ -192,7 +192,13 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
     version = lib.read_magic(file)
     if version not in header:
         raise ValueError(f"found .npy format version {version}, expected 1.0 or 2.0")
-    return header[version](file)
+    try:
+        found = header[version](file)
+    except Exception as error:  # NumPy raises errors of many types for text that is no header.
+        raise ValueError(f"the .npy header is damaged: {error}") from None
+    if not all(type(size) is int and 0 <= size < 2**31 for size in found[0]):
+        raise ValueError(f"the .npy header is damaged: found shape {found[0]}")
+    return found
 
 
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
