@@ -307,8 +307,9 @@ class Converter:
 
     @property
     def quantum(self) -> float:
-        """Mean slope of the calibration curve [Pa per count]."""
-        return self.saturation / self._full
+        """Mean slope of the calibration curve [Pa per count], from zero offset to saturation."""
+        counts = np.maximum(self._full - self.zero, 0.0)[self.live]
+        return float(self._ends()[self.live].sum() / max(counts.sum(), 1.0))
 
 
 def least_end(ends: FloatArray) -> float:
@@ -339,6 +340,8 @@ def _contradiction(calibration: Calibration) -> str:
         return "tare.correlation: expected rows of equal length whose first number is 1"
     if calibration.equilibrate and not any(map(any, calibration.equilibrate.gain)):
         return "equilibrate.gain: found only dead cells (gain 0), expected at least one live cell"
+    if not Converter(calibration.model_copy(update={"curve": None}), 1.0).saturation > 0.0:
+        return f"tare.zero: most cells are saturated at {sensor.full_count} counts without a load"
     if calibration.curve:
         converter = Converter(Calibration(sensor=sensor, date="", curve=calibration.curve), 1.0)
         pressures = converter.pressure(np.arange(sensor.full_count + 1.0))

@@ -192,7 +192,13 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
     version = lib.read_magic(file)
     if version not in header:
         raise ValueError(f"found .npy format version {version}, expected 1.0 or 2.0")
-    return header[version](file)
+    try:
+        found = header[version](file)
+    except Exception as error:  # NumPy raises errors of many types for text that is no header.
+        raise ValueError(f"the .npy header is damaged: {error}") from None
+    if not all(type(size) is int and 0 <= size < 2**31 for size in found[0]):
+        raise ValueError(f"the .npy header is damaged: found shape {found[0]}")
+    return found
 
 
 def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
@@ -212,19 +218,21 @@ def _read_array(file: IO[bytes], size: int) -> NDArray[Any]:
 
 def _export(path: Path, settings: TactileSettings, notes: list[str]) -> FrameRecording:
     export = tekscan.parse(tekscan.decode(read_file(path)), 1.0 / settings.rate)
-    if export.raw:  # Count in units of one.
-        noise = settings.noise / settings.pascal_per_count
-        settings = settings.model_copy(update={"pascal_per_count": 1.0, "noise": noise})
-    found = _checked({"frames": export.values}, settings, notes)
+    found = _checked({"frames": export.values}, settings, notes, export.raw)
     full_count = None
     if math.isfinite(export.full):
-        full_count = max(min(int(export.full / settings.pascal_per_count), _COUNT_MAX), 1)
-    return replace(found, t=export.t, pitch=export.pitch, full_count=full_count, whole=export.raw)
+        scale = 1.0 if export.raw else settings.pascal_per_count
+        full_count = max(min(int(export.full / scale), _COUNT_MAX), 1)
+    return replace(found, t=export.t, pitch=export.pitch, full_count=full_count)
 
 
 def _checked(
-    arrays: dict[str, NDArray[Any]], settings: TactileSettings, notes: list[str]
+    arrays: dict[str, NDArray[Any]],
+    settings: TactileSettings,
+    notes: list[str],
+    raw: bool = False,
 ) -> FrameRecording:
+    """Check the arrays and convert the frames to counts; ``raw`` floats are counts, not Pa."""
     frames = arrays["frames"]
     if frames.ndim != 3 or frames.size == 0:
         raise ValueError(f"frames: found shape {frames.shape}, expected [n, rows, cols]")
@@ -237,7 +245,7 @@ def _checked(
             raise ValueError(f"live: found shape {live.shape}, expected {frames.shape[1:]}")
         if not live.any():
             raise ValueError("live: found only False, expected True for each cell of the sensor")
-    whole = frames.dtype.kind != "f"
+    whole = raw or frames.dtype.kind != "f"
     scale = 1.0 if whole else settings.pascal_per_count
     frames, live = _without_dead(frames, live, _COUNT_MAX * scale)
     _check_below(frames, live, settings.noise * scale / settings.pascal_per_count, notes)
@@ -252,7 +260,9 @@ def _checked(
     if "t" in arrays:
         t = _seconds(_row(arrays, "t", count), settings.rate, notes)
     truths = {name: _row(arrays, name, count).astype(np.float64) for name in TRUTHS & arrays.keys()}
-    counts = np.maximum(frames if whole else np.round(frames / scale), 0).astype(np.uint16)
+    if frames.dtype.kind == "f":
+        frames = np.round(frames / scale)
+    counts = np.maximum(frames, 0).astype(np.uint16)
     return FrameRecording(counts, t, live, truths, largest, whole)
 
 

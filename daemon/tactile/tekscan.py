@@ -207,7 +207,12 @@ def _cells(line: str, separator: str, cols: int) -> list[str]:
     if separator == " ":
         return line.split(None, _SIZE_MAX)
     if '"' in line:
-        cells = next(csv.reader([line], delimiter=separator[0], skipinitialspace=True))
+        try:
+            cells = next(csv.reader([line], delimiter=separator[0], skipinitialspace=True))
+        except csv.Error as error:
+            raise TekscanError(
+                f"found {line[:40]!r}…: {error}; check the quotation marks"
+            ) from None
     else:
         cells = line.split(separator, 2 * _SIZE_MAX)
     while len(cells) > cols and not cells[-1].strip(_EDGE_CHARACTERS):

@@ -145,16 +145,19 @@ def equilibrate(loads: Sequence[ArrayLike], zero: FloatArray) -> Equilibration:
 
     Each gain is the least-squares fit of a cell's readings to the mean of all working cells. Cells
     with less than a fifth of the median response are considered dead. Raises CalibrationError if
-    the frames do not contain any pressure.
+    the frames do not contain a pressure that exceeds the noise.
     """
     if not loads:
         raise CalibrationError("equilibrate: expected at least one uniform pressure")
-    readings = np.stack([stack_of(load, "equilibrate").mean(axis=0) - zero for load in loads])
+    stacks = [stack_of(load, "equilibrate") for load in loads]
+    readings = np.stack([stack.mean(axis=0) - zero for stack in stacks])
     response = readings.sum(axis=0)
+    error = np.sqrt(np.sum([stack.var(axis=0) / len(stack) for stack in stacks], axis=0))
     typical = float(np.median(response))
-    if not typical > 0.0:
+    if not typical > _SIGNIFICANT_SIGMA * float(np.median(error)):
         raise CalibrationError(
-            "equilibrate: the readings of most cells do not exceed the zero offsets"
+            "equilibrate: the readings of most cells do not exceed the zero offsets and the noise: "
+            "apply more pressure, or record more frames"
         )
     active = response > DEAD_RESPONSE * typical
     target = np.array([reading[active].mean() for reading in readings])

@@ -32,7 +32,7 @@ TOE = 0.1  # half width of the toe around the first contact, as a fraction of th
 # Points above this fraction of the maximum force are used to extrapolate to zero force.
 _STEEP = 0.2
 _POWER = 0.55  # exponent p for which F^p is nearly linear in d, for springs and for solid rubber
-_FEWEST = 6  # minimum number of fitted rows per run
+_FEWEST = 6  # minimum number of fitted rows in contact per run
 _LOADED = 20.0  # minimum force range of a run, as a multiple of the noise
 # Minimum noise due to rounding and interpolation, as a fraction of the maximum force.
 _SMOOTHEST = 1e-4
@@ -274,6 +274,8 @@ def fit_compression(runs: Sequence[Run], tip: Fingertip, law: Material | None) -
     else:
         raise CalibrationError(_NO_BEGINNING)
     if any(zero < run.d.min() - run.toe for zero, run in zip(begins, runs, strict=True)):
+        raise CalibrationError(_NO_BEGINNING)
+    if (np.count_nonzero(own[d > begins[owner]], axis=0) < _FEWEST).any():
         raise CalibrationError(_NO_BEGINNING)
     if (d - begins[owner]).max() > end:
         raise CalibrationError(_TOO_DEEP)

@@ -184,18 +184,39 @@ def compare_tips(
     Springs are fitted with a constant modulus. If ``material`` is nonlinear, springs are also
     fitted with the law of ``material``. For solid rubber, ν is a free parameter. Both base types
     are fitted with a frictionless face. The better base type is then also fitted with a sticking
-    face.
+    face. Solid models are omitted if a press is outside the range of their data.
     """
     fits = [fit_tip(presses, Fingertip(radius), grid)]
     if not material.is_linear:
         law = _scaled(material, 1.0 / material.reference_modulus)
         fits.append(fit_tip(presses, Fingertip(radius), grid, law))
     bonded = Fingertip(radius, "solid")
-    both = [_best_poisson(presses, tip, grid) for tip in (bonded, replace(bonded, base="lying"))]
-    better = min(both, key=lambda fit: fit.chi2).tip
-    fits += [*both, _best_poisson(presses, replace(better, face="sticking"), grid)]
+    if covers(bonded, presses.d, presses.theta).all():
+        bases = bonded, replace(bonded, base="lying")
+        both = [_best_poisson(presses, tip, grid) for tip in bases]
+        better = min(both, key=lambda fit: fit.chi2).tip
+        fits += [*both, _best_poisson(presses, replace(better, face="sticking"), grid)]
     fits = [_with_errors(presses, each, grid, active) for each in fits if each.chi2 < math.inf]
     return sorted(fits, key=lambda fit: fit.chi2)
+
+
+def covers(tip: Fingertip, d: FloatArray, theta: FloatArray) -> NDArray[np.bool_]:
+    """Return a mask [n] of the contacts that are within the range of the tip's contact table."""
+    inside = ContactTable.build(tip, _UNIT_MATERIAL)(d, theta, edge=True).inside
+    return np.asarray(inside, np.bool_)
+
+
+def require_covered(
+    step: str, tip: Fingertip, d: FloatArray, theta: FloatArray, offset: float = 0.0
+) -> None:
+    """Raise CalibrationError if the tip's contact table does not cover all contacts."""
+    inside = covers(tip, d - offset, theta)
+    if not inside.all():
+        k = int(np.argmin(inside))
+        raise CalibrationError(
+            f"{step}: d = {d[k] * 1e3:g} mm at θ = {math.degrees(theta[k]):.3g}° is outside the "
+            f"range of the model (tip.physics = {tip.physics}): reduce d or θ"
+        )
 
 
 def _best_poisson(presses: Presses, tip: Fingertip, grid: SensorGrid) -> TipFit:
@@ -260,7 +281,7 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
 
     The fit minimises the squared relative errors. ``d`` [m], ``theta`` [rad] and ``force`` [N] have
     shape [n]. ``force`` is measured by the sensor. Raises CalibrationError if there are too few
-    points, or if the force does not increase with d.
+    points, if the force does not increase with d, or if a point is outside the contact table.
     """
     depth, tilt, load = (np.asarray(each, np.float64) for each in (d, theta, force))
     if not depth.shape == tilt.shape == load.shape:
@@ -273,7 +294,7 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
         raise CalibrationError("modulus: the force does not increase with d")
     unit, offset, modulus = ContactTable.build(tip, Material.constant(1.0)), 0.0, 0.0
     for _ in range(30):
-        c = unit(np.maximum(depth - offset, 1e-9), tilt)
+        c = unit(np.maximum(depth - offset, 1e-9), tilt, edge=True)
         columns = np.stack([c.force, -c.force_d], axis=1) / load[:, None]
         modulus, shift = np.linalg.lstsq(columns, np.ones(len(load)), rcond=None)[0].tolist()
         if not modulus > 0.0 or np.count_nonzero(depth > offset) < 3:
@@ -285,6 +306,7 @@ def fit_modulus(d: ArrayLike, theta: ArrayLike, force: ArrayLike, tip: Fingertip
         offset += step
         if abs(step) < 1e-9:
             break
+    require_covered("modulus", tip, depth, tilt, offset)
     fitted = modulus * unit(np.maximum(depth - offset, 1e-9), tilt).force
     errors = fitted / load - 1.0
     alone = trend(depth, modulus / (1.0 + errors), load, tip.physics)

@@ -195,7 +195,9 @@ def _break_aways(q: FloatArray, rate: FloatArray, push: FloatArray, goal: FloatA
     for last in np.flatnonzero(rests[:-1] & ~rests[1:]):
         way = q[last:] - q[last]
         away = np.flatnonzero(np.abs(way) > _BREAK_AWAY_DISTANCE)
-        led = goal[max(last - steps, 0) : last + int(away[0]) + steps] if away.size else goal
+        if not away.size:
+            continue
+        led = goal[max(last - steps, 0) : last + int(away[0]) + steps]
         if np.abs(led[steps:] - led[:-steps]).max(initial=0.0) > speed * steps * _GRID_STEP:
             continue
         toward = math.copysign(1.0, way[away[0]]) * push[last : last + away[0] + 1]

@@ -7,6 +7,8 @@ import pytest
 
 from softfinger.daemon.profile.load import load
 from softfinger.daemon.servos import control_table as reg
+from softfinger.daemon.simulation.emulator.folder import carry_out
+from softfinger.tools.calibration import joints
 from softfinger.tools.calibration.joints import put
 from softfinger.tools.cli import main
 from tests.harness.emulated import HIL, SdkServos, emulated
@@ -72,6 +74,19 @@ def test_moving_the_wrong_finger_is_refused(hand, tmp_path, capsys, turn, told):
     folder, _ = hand
     assert calibrate(folder, tmp_path / "a.toml", "--config", "hil", *by_hand(folder, turn)) == 1
     assert told in capsys.readouterr().err
+    assert not (tmp_path / "a.toml").exists()
+
+
+def test_moving_the_other_finger_in_the_last_pose_is_refused(hand, tmp_path, capsys, monkeypatch):
+    folder, _ = hand
+
+    def bring(_arguments, _told, finger, pose):
+        carry_out(folder, f"turn {finger}={pose}" + " right=open" * (pose == "zero"))
+
+    carry_out(folder, "turn right=closed")
+    monkeypatch.setattr(joints, "bring", bring)
+    assert calibrate(folder, tmp_path / "a.toml", "--config", "hil") == 1
+    assert "left finger: servos 2 and 1 rotated" in capsys.readouterr().err
     assert not (tmp_path / "a.toml").exists()
 
 

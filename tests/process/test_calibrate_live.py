@@ -3,6 +3,7 @@
 import contextlib
 import io
 import math
+import signal
 import sys
 
 import numpy as np
@@ -110,16 +111,44 @@ def test_relaxation_is_zero_for_a_tip_without_relaxation(live):
     assert "written to" not in said
 
 
-def test_missing_loads_change_nothing(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("step", ["centre --theta 0 5", "centre", "equilibrate", "relaxation"])
+def test_missing_loads_change_nothing(step, tmp_path, capsys, monkeypatch):
     profile = tmp_path / "press.toml"
     profile.write_text(PROFILE.replace('clock = "virtual"', 'clock = "real"'))
     monkeypatch.setattr(sys, "stdin", type("Ended", (), {"readline": lambda _: ""})())
     monkeypatch.setattr(calibration_frames, "RealClock", VirtualClock)
     file = tmp_path / "a.json"
-    words = ["calibrate", "centre", str(file), "--theta", "0", "5", "--config", str(profile)]
+    name, *words = step.split()
+    words = ["calibrate", name, str(file), *words, "--config", str(profile)]
     assert main([*words, "--no-plot", "--frames", "8"]) == 1
     assert "ended before all loads were applied" in capsys.readouterr().err
     assert not file.exists()
+
+
+def test_a_missing_folder_is_reported_before_the_first_load(tmp_path, capsys):
+    (tmp_path / "press.toml").write_text(PROFILE)
+    words = ["calibrate", "centre", str(tmp_path / "no" / "a.json"), "--move", "true"]
+    assert main([*words, "--config", str(tmp_path / "press.toml")]) == 1
+    assert capsys.readouterr().err == f"calibrate: {tmp_path / 'no'}: No such file or directory\n"
+
+
+@pytest.mark.parametrize("step", ["centre", "relaxation"])
+def test_ctrl_c_ends_the_wait_for_a_load(step, tmp_path, monkeypatch):
+    is_waiting = []
+
+    class Terminal:
+        def readline(self) -> str:
+            signal.raise_signal(signal.SIGINT)
+            is_waiting.append(True)
+            return ""
+
+    profile = tmp_path / "press.toml"
+    profile.write_text(PROFILE.replace('clock = "virtual"', 'clock = "real"'))
+    monkeypatch.setattr(sys, "stdin", Terminal())
+    monkeypatch.setattr(calibration_frames, "RealClock", VirtualClock)
+    words = ["calibrate", step, str(tmp_path / "a.json"), "--config", str(profile)]
+    assert main(words) == 130
+    assert not is_waiting
 
 
 def test_the_end_of_a_replay_is_reported(tmp_path, capsys, monkeypatch):

@@ -10,8 +10,11 @@ import pytest
 
 from softfinger.daemon.loop.build import Daemon
 from softfinger.daemon.perception.calibration_file import (
+    Calibration,
     CalibrationFileError,
     Converter,
+    Sensor,
+    TareStep,
     load_calibration,
 )
 from softfinger.daemon.profile.load import load
@@ -144,6 +147,13 @@ def test_counts_are_converted_to_the_true_pressure(bench):
     assert np.abs(found[~live & (pressure == 0)]).mean() < 50.0
 
 
+@pytest.mark.parametrize("zero", [0.0, 120.0])
+def test_the_size_of_a_count_does_not_depend_on_the_zero_offset(zero):
+    sensor = Sensor(finger="left", label="", rows=4, cols=4, pitch=(1e-3, 1e-3), full_count=255)
+    tare = TareStep(date="", zero=[[zero] * 4] * 4, noise=1.0, frames=9)
+    assert Converter(Calibration(sensor=sensor, date="", tare=tare), 500.0).quantum == 500.0
+
+
 def daemon_settings(folder, recording, **tactile) -> Settings:
     settings = load(folder / "profile.toml")
     tactile = {
@@ -155,6 +165,25 @@ def daemon_settings(folder, recording, **tactile) -> Settings:
     raw = settings.model_dump()
     raw["tactile"].update(tactile)
     return Settings.model_validate(raw)
+
+
+def test_a_recording_of_an_unloaded_tip_may_contain_its_true_d(tmp_path):
+    (tmp_path / "profile.toml").write_text(PROFILE)
+    np.savez(tmp_path / "rest.npz", frames=MadeUp().counts(np.zeros((N, N)), 9), d=np.zeros(9))
+    given = ["--config", str(tmp_path / "profile.toml"), "--no-plot"]
+    words = ["calibrate", "tare", str(tmp_path / "a.json"), *given]
+    assert main([*words, "--recording", str(tmp_path / "rest.npz")]) == 0
+    assert load_calibration(tmp_path / "a.json").tare.frames == 9
+
+
+def test_a_result_is_told_if_its_plot_cannot_be_written(bench, tmp_path, capsys):
+    folder, _ = bench
+    (tmp_path / "a.tare.png").mkdir()
+    words = ["--config", str(folder / "profile.toml"), "--recording", str(folder / "rest.npz")]
+    assert main(["calibrate", "tare", str(tmp_path / "a.json"), *words]) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("tare: 200 frames")
+    assert "the result was not plotted: [Errno 21] Is a directory: " in told.err
 
 
 def test_the_daemon_applies_the_file(bench, tmp_path):
@@ -197,8 +226,11 @@ def test_subscribers_get_counts_or_the_calibrated_pressure(bench, tmp_path):
         if each is settings:
             assert (message["unit"], message["calibrated"]) == ("count", False)
             assert shown is frame.data
+            # The scale is the mean slope of the curve up to saturation, but these readings are at
+            # a fifth of this range, where the slope of x^1.25 is two thirds of the mean slope.
             strong = pressure > 2e4
-            assert shown[strong] * message["scale"] == pytest.approx(pressure[strong], rel=0.6)
+            ratio = shown[strong] * message["scale"] / pressure[strong]
+            assert np.median(ratio) == pytest.approx(5.0 ** (EXPONENT - 1.0), rel=0.1)
         else:
             assert (message["unit"], message["calibrated"]) == ("Pa", True)
             assert np.abs(shown * message["scale"] - pressure).max() <= 0.5 * message["scale"]
@@ -271,6 +303,10 @@ def test_a_gain_that_no_grip_has_measured_is_refused(tmp_path, capsys, monkeypat
         (lambda c: c["tare"]["zero"][3].__setitem__(4, -1.0), "expected numbers ≥ 0"),
         (lambda c: c["tare"]["zero"][3].__setitem__(4, float("nan")), "tare"),
         (
+            lambda c: c["tare"].update(zero=[[4095.0] * N] * N),
+            "tare.zero: most cells are saturated",
+        ),
+        (
             lambda c: c["curve"].update(coefficients=[1.0, 5.0, -1.0, 0.0]),
             "must increase",
         ),
@@ -323,12 +359,29 @@ def test_an_invalid_calibration_file_is_refused_with_the_reason(bench, tmp_path,
             {"d": [0.002, 0.004], "words": ["--force", "1", "2", "3"]},
             "--force: found 3 values for 2 loads",
         ),
+        (
+            "curve",
+            {
+                "d": [0.004, 0.009],
+                "words": ["--set", "tip.physics=solid", "--set", "safety.d_max=0.008"],
+            },
+            "curve: d = 9 mm at θ = 0° is outside the range of the model (tip.physics = solid)",
+        ),
         ("equilibrate", {"frames": SATURATED}, "equilibrate: load 1 saturates a cell"),
         (
             "curve",
             {"frames": SATURATED, "words": ["--force", "1"]},
             "curve: load 1 saturates a cell",
         ),
+        (
+            "tare",
+            {
+                "frames": np.concatenate([MadeUp().press(d, frames=5) for d in (0, 0.004)]),
+                "d": np.repeat([0.0, 0.004], 5),
+            },
+            "tare: the readings of ",
+        ),
+        ("tare", {"frames": np.full((9, N, N), 4095, np.uint16)}, "tare: most cells are saturated"),
         (
             "law",
             {"frames": np.zeros((3, N, N), np.uint16), "d": [0.002, 0.004, 0.006]},

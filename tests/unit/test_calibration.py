@@ -106,6 +106,14 @@ def test_equilibration_equalises_cells_and_finds_dead_ones():
     assert found.residual < 2e-3
 
 
+def test_the_noise_of_an_unloaded_sensor_is_not_equilibrated():
+    zero = RNG.uniform(10, 40, (32, 32))
+    for _ in range(20):
+        rest = np.round(zero + RNG.standard_normal((64, 32, 32)))
+        with pytest.raises(CalibrationError, match="do not exceed the zero offsets and the noise"):
+            equilibrate([rest], tare(np.round(zero + RNG.standard_normal((64, 32, 32)))).zero)
+
+
 @pytest.mark.parametrize("kind", ["power", "cubic"])
 def test_the_curve_is_recovered_from_known_weights(kind):
     # The response curve gives the pressure as a function of the reading x. The test inverts the

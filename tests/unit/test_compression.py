@@ -209,6 +209,13 @@ def test_a_run_that_starts_in_contact_is_rejected():
         fit_compression([run], Fingertip(A), UNIT)
 
 
+def test_a_fit_in_which_the_tip_hardly_touches_is_rejected():
+    d = np.linspace(0.0, 7e-3, 12)
+    run = loading(d, math.pi * E * d**1.5)
+    with pytest.raises(CalibrationError, match="must include the onset of contact"):
+        fit_compression([run], Fingertip(A, "solid"), UNIT)
+
+
 def written(path: Path, header: str, rows: list[str]) -> Path:
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return path
@@ -260,6 +267,7 @@ def test_file_formats_of_testing_machines_are_read(tmp_path, capsys, header, for
         ("d [mm],F [N]", "1,2\n1.1", "line 3: force: found '', expected a number"),
         ('"d\n[mm]",F [N]', "1,2", "'d': found the unit 'mm]\"', expected one of mm"),
         ("strain [kPa],stress [kPa]", "1,2", "'strain [kPa]': found the unit 'kPa'"),
+        ("d [mm],F [N]", f'1,"{200_000 * "2"}', "field larger than field limit (131072): check"),
     ],
 )
 def test_an_unreadable_file_is_rejected_and_nothing_is_written(tmp_path, capsys, header, row, told):

@@ -1,16 +1,22 @@
 """Test `calibrate friction` and `calibrate latency` on hands for which the profile is wrong."""
 
+import argparse
 import math
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
 
+from softfinger import Hand
+from softfinger.daemon.client.command_client import NoAnswer
+from softfinger.daemon.errors import Refused
 from softfinger.daemon.profile.load import load
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.calibration.latency_fit import fit_latency
 from softfinger.kinematics.calibration.servo_fit import fit_friction
+from softfinger.tools.calibration import motion
 from softfinger.tools.calibration.motion import _way
 from softfinger.tools.cli import main
 from tests.harness.recorded_hand import record_hand
@@ -99,6 +105,14 @@ def test_torque_independent_of_direction_is_not_friction():
         fit_friction([], [], [], [], 0.010, COUNT)
 
 
+def test_a_joint_that_settles_without_its_goal_did_not_break_away():
+    # A person moves the joint and lets go: the joint creeps by 3 mrad, and the goal never moves.
+    moved = 0.5 * np.abs(np.arange(0.0, 6.0, 0.01) % 2.0 - 1.0)
+    q = np.concatenate([moved, np.full(100, 0.5), np.linspace(0.5, 0.503, 4), np.full(100, 0.503)])
+    fit = fit_friction(0.01 * np.arange(q.size), q, np.zeros(q.size), 0.1 - 0.2 * q, 0.01, COUNT)
+    assert math.isnan(fit.stiction)
+
+
 def test_only_motion_without_contact_is_used(tmp_path, capsys):
     due: Due = {
         100: {"command": "arm"},
@@ -130,6 +144,27 @@ def test_impossible_times_are_refused():
 def test_data_without_friction_are_refused(tmp_path, capsys, words, why):
     assert calibrate("friction", tmp_path, *words) == 1
     assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["command", "disarm"])
+@pytest.mark.parametrize(
+    ("error", "is_stopped"),
+    [(NoAnswer("no reply"), True), (KeyboardInterrupt(), True), (Refused("in use"), False)],
+    ids=["no reply", "Ctrl-C", "refused"],
+)
+def test_torque_is_off_after_a_command_without_a_reply(monkeypatch, command, error, is_stopped):
+    client = MagicMock(spec=Hand)
+    client.__enter__.return_value = client
+    getattr(client, command).side_effect = error
+    seen = [Mock(mode=mode, torque=mode == "armed", mono_ns=1) for mode in ("disarmed", "armed")]
+    monkeypatch.setattr(motion, "Hand", lambda *_, **__: client)
+    monkeypatch.setattr(motion, "subscribe", MagicMock())
+    monkeypatch.setattr(motion.LiveHand, "states", lambda _: iter(seen))
+    arguments = argparse.Namespace(address=("tcp://127.0.0.1:1", ""), keys=None)
+    with pytest.raises(type(error)), motion.live_hand(arguments):
+        pass
+    # A refused `arm` has no effect, so the hand may belong to another client.
+    assert client.stop.called == (is_stopped or command == "disarm")
 
 
 def test_a_sweep_avoids_contact():

@@ -8,6 +8,7 @@ import pytest
 
 from softfinger import ContactTable, Fingertip, Material, SensorGrid
 from softfinger.daemon.perception.calibration_file import load_calibration
+from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.calibration.press_fit import (
     Presses,
     compare_tips,
@@ -57,8 +58,11 @@ def test_the_true_tip_model_fits_best(tip):
         assert best.tip.poisson == pytest.approx(0.48, abs=0.01)
 
 
-def test_tip_models_without_a_positive_modulus_are_omitted():
-    d, theta = (2e-3, 4e-3, 6e-3), np.radians([0.0, 30.0, 60.0]).tolist()
+@pytest.mark.parametrize(
+    ("d", "degrees"), [((2e-3, 4e-3, 6e-3), (0.0, 30.0, 60.0)), ((2e-3, 4e-3, 9e-3), (0.0,) * 3)]
+)
+def test_solid_models_are_omitted_outside_the_range_of_their_data(d, degrees):
+    theta = np.radians(degrees).tolist()
     seen = np.stack(
         [GRID.pressure(Fingertip(0.020), RUBBER, *pose) for pose in zip(d, theta, strict=True)]
     )
@@ -66,6 +70,17 @@ def test_tip_models_without_a_positive_modulus_are_omitted():
     (only,) = compare_tips(presses, 0.020, GRID, np.ones(GRID.shape, np.bool_))
     assert only.tip.physics == "springs"
     assert only.modulus == pytest.approx(0.25e6, rel=1e-3)
+
+
+@pytest.mark.parametrize(("tip", "d"), [(TIP, 9e-3), (Fingertip(0.020), 18e-3)])
+def test_a_modulus_is_not_fitted_outside_the_range_of_the_model(tip, d):
+    depths = np.array([2e-3, 4e-3, 6e-3, d])
+    load = ContactTable.build(tip, RUBBER)(depths, 0.0, edge=True).force
+    told = f"d = {d * 1e3:g} mm at θ = 0° is outside the range of the model"
+    with pytest.raises(CalibrationError, match=told):
+        fit_modulus(depths, np.zeros(4), load, tip)
+    inside = fit_modulus(depths[:-1], np.zeros(3), load[:-1], tip)
+    assert inside.modulus == pytest.approx(0.25e6, rel=1e-6)
 
 
 @pytest.mark.extended

@@ -117,6 +117,20 @@ def test_invalid_recordings_are_reported(tmp_path, held, told):
         read_frames(path, 0.001, 100.0)
 
 
+@pytest.mark.parametrize(
+    "header",
+    ["{'descr': '<f8', ", "{[]: 1}", "-" * 3000 + "1", "  a\n b",
+     "{'descr': '<f8', 'fortran_order': False, 'shape': (True, 4, 4), }",
+     f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({10**20}, 0, 4), }}"],
+)  # fmt: skip
+def test_a_damaged_header_is_reported(header, tmp_path):
+    text = f"{header}\n".encode()
+    start = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little")
+    (tmp_path / "a.npy").write_bytes(start + text + bytes(999))
+    with pytest.raises(RecordingError, match=r"a\.npy: the \.npy header is damaged: "):
+        read_frames(tmp_path / "a.npy", 4.0, 100.0)
+
+
 def test_unreadable_files_are_reported(tmp_path):
     with pytest.raises(RecordingError, match="No such file"):
         read_frames(tmp_path / "none.npz", 1.0, 1.0)

@@ -105,6 +105,7 @@ def test_a_single_frame_needs_no_frame_line():
         ("7,255,1\n", "", "frame 4 has 1 of 2 rows"),
         ("3,4,5\n", "", "the file ends within frame 6, which has 1 of 2 rows"),
         ("3,4,5\n", "3,4,5\n6,7,8\n", "line 22"),
+        ("3,4,5\n", f'3,4,"{200_000 * "5"}\n', "found '3,4,\"5555.*check the quotation marks"),
     ],
 )
 def test_files_that_are_not_exports_are_reported(old, new, told):
@@ -125,6 +126,9 @@ def test_an_export_is_read_as_a_recording(tmp_path):
         path.write_text(EXPORT.replace("7,255,1", f"7,{value},1"))
         with pytest.raises(RecordingError, match=f"row 2, cell 2 .* is {value}, expected"):
             read_frames(path, 4.0, 100.0)
+    path.write_text(EXPORT.replace("7,255,1", "7,70000,1"))
+    with pytest.raises(RecordingError, match=r"is 70000, expected at most 65535 counts$"):
+        read_frames(path, 4.0, 100.0)
     path.write_text("nothing")
     with pytest.raises(
         RecordingError, match=r"run\.asf: the file does not contain an ASCII_DATA line"

@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--frames", type=_frames, default=64, help="number of live frames per load (default 64)"
     )
     parser.add_argument(
-        "--loads", type=int, default=0, help="equilibrate, live: number of pressures"
+        "--loads", type=int, default=1, help="equilibrate, live: number of pressures (default 1)"
     )
     for name, unit in (("force", "N"), ("d", "mm"), ("theta", "degrees")):
         parser.add_argument(
@@ -135,6 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CalibrationError(
             f"--compression: found the `{step}` step, but only the `law` step uses this option"
         )
+    arguments.file.parent.stat()  # Report a missing folder before the user applies any loads.
     if step in _OF_PROFILE and arguments.config is None:
         arguments.config = arguments.file
     settings = profile(arguments)
@@ -184,7 +185,7 @@ def _calibrate_tip(arguments: argparse.Namespace, settings: Settings) -> str:
     if panels and not arguments.no_plot:
         try:
             draw(arguments.step, panels, file.with_name(f"{file.stem}.{arguments.step}.png"))
-        except MissingExtra as error:
+        except (MissingExtra, OSError) as error:
             print(f"calibrate: the result was not plotted: {error}", file=sys.stderr)
     return line
 

@@ -8,6 +8,7 @@ import math
 import shlex
 import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -55,7 +56,8 @@ def gather(arguments: argparse.Namespace, settings: Settings, calibration: Calib
     if arguments.recording:
         runs = [_read(path, settings.tactile, sensor) for path in arguments.recording]
         whole = runs[0]
-        if len(runs) == 1 and whole.truths and arguments.step != "relaxation":
+        by_frame = arguments.step not in ("tare", "equilibrate", "relaxation")
+        if len(runs) == 1 and whole.truths and by_frame:
             # If one recording contains the whole run, each frame with a contact is a separate load.
             truths = whole.truths | _spread(given, len(whole.t))
             used = truths["d"] > 0.0 if "d" in truths else np.ones(len(whole.t), bool)
@@ -114,10 +116,10 @@ def _live(
     loads = []
     with _opened(settings, clock, finger) as backend:
         for k in range(count):
-            if count > 1 or truths:
+            if arguments.step != "tare":
                 load = {name: values[k] / _UNITS[name] for name, values in truths.items()}
                 words = ", ".join(f"{name} {value:g}" for name, value in load.items())
-                told = f"apply load {k + 1} of {count}: {words or 'uniform pressure'}"
+                told = f"apply load {k + 1} of {count}{f': {words}' * bool(words)}"
                 if arguments.step == "relaxation":
                     loads.append(_while_pressed(arguments, backend, clock, told, load))
                     continue
@@ -139,11 +141,20 @@ def _while_pressed(
     """Return the last frames before a load is applied, and ``--frames`` frames under the load."""
     before: deque[Frame] = deque(maxlen=_BEFORE)
     frames = _fresh(backend, clock)
-    with ThreadPoolExecutor(1) as pool:
-        brought = pool.submit(bring, arguments, told, load=1, **load)
-        while not brought.done():
+    is_applied = threading.Event()
+
+    def collect() -> None:
+        while not is_applied.is_set():
             before.append(next(frames))
-        brought.result()
+
+    with ThreadPoolExecutor(1) as pool:
+        collected = pool.submit(collect)
+        try:
+            # Ctrl-C interrupts only the main thread, so this thread waits for Enter.
+            bring(arguments, told, load=1, **load)
+        finally:
+            is_applied.set()
+        collected.result()
     return [*before, *(next(frames) for _ in range(arguments.frames))]
 
 

@@ -97,7 +97,10 @@ def read_csv(path: Path) -> dict[str, FloatArray]:
         raise CalibrationError(f"{path}: the file is empty, expected {_EXAMPLE}")
     separator = next((each for each in "\t;" if each in lines[0][1]), ",")
     rows = (csv.reader([line], delimiter=separator, skipinitialspace=True) for _, line in lines)
-    header, *cells = ([cell.strip() for cell in next(row)] for row in rows)
+    try:
+        header, *cells = ([cell.strip() for cell in next(row)] for row in rows)
+    except csv.Error as error:
+        raise CalibrationError(f"{path}: {error}: check the quotation marks") from None
     below = cells[0] if cells and not any(map(_is_number, cells[0])) else []
     columns = _columns(path, header, below)
     found: dict[str, list[float]] = {name: [] for name in columns}

@@ -119,7 +119,10 @@ def _read(line: ServoLine, ids: list[int]) -> _Counts:
 
 
 def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
-    """Return the servo that rotated between the closed and open poses. Raises CalibrationError."""
+    """Return the servo that rotated between the closed and open poses.
+
+    Raises CalibrationError if it rotated too little, or if another servo rotated in any pose.
+    """
     moved = {k: abs(at["closed"][k] - at["open"][k]) * radian for k in at["open"]}
     servo, *others = sorted(moved, key=lambda k: -moved[k])
     if moved[servo] < _LEAST:
@@ -128,7 +131,8 @@ def _turned(name: str, at: dict[str, _Counts], radian: float) -> int:
             f"open, expected at least {math.degrees(_LEAST):.0f}°"
         )
     for other in others:
-        if moved[other] > _ALONE * moved[servo]:
+        counts = [pose[other] for pose in at.values()]
+        if (max(counts) - min(counts)) * radian > _ALONE * moved[servo]:
             raise CalibrationError(
                 f"{name} finger: servos {servo} and {other} rotated, expected one servo: move "
                 "only one finger"

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from softfinger.daemon.client.connection import REPLY_TIMEOUT, drain, subscribe, unpack
 from softfinger.daemon.client.hand import Hand
 from softfinger.daemon.client.stream import no_stream, read, to_columns
-from softfinger.daemon.errors import HandFault
+from softfinger.daemon.errors import HandFault, Refused
 from softfinger.daemon.perception.perception import FingerPerception
 from softfinger.daemon.profile.settings import Settings
 from softfinger.daemon.servos.control_table import COUNTS_PER_TURN, by_name
@@ -50,12 +50,16 @@ class LiveHand:
     def __init__(self, client: Hand, socket: zmq.Socket[Any]) -> None:
         self._client, self._socket = client, socket
         self._taken: list[tuple[bytes, dict[str, Any]]] = []
-        self.commanded = False  # True once the daemon has accepted a command
+        self.commanded = False  # True once the daemon may have executed a command
 
     def command(self, name: str, **numbers: float) -> None:
         """Send a command. Raises Refused or NoAnswer."""
-        self._client.command(name, **numbers)
-        self.commanded = True
+        before, self.commanded = self.commanded, True  # A command may be executed without a reply.
+        try:
+            self._client.command(name, **numbers)
+        except Refused:
+            self.commanded = before
+            raise
 
     def states(self) -> Iterator[HandState]:
         """Store all messages and repeatedly yield the newest state. Raises NoStream."""
@@ -119,12 +123,12 @@ def live_hand(arguments: argparse.Namespace) -> Iterator[LiveHand]:
                     hand.command("arm")
                 hand.until(lambda state: state.mode == "armed" and state.torque)
                 yield hand
+                if mode == "disarmed":
+                    client.disarm()
             except BaseException:
                 if hand.commanded:
                     client.stop()
                 raise
-            if mode == "disarmed":
-                client.disarm()
 
 
 def _source(

@@ -47,9 +47,11 @@ from softfinger.kinematics.calibration.press_fit import (
     TipFit,
     Trend,
     compare_tips,
+    covers,
     first_cycle,
     fit_centre,
     fit_modulus,
+    require_covered,
 )
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
@@ -181,7 +183,12 @@ def _tare(step: Step) -> Done:
     noise = float(np.median(found.noise))
     count = sum(map(len, step.loads.frames))
     rho = found.correlation
-    result = _kept(TareStep, found, noise=noise, frames=count)
+    calibration = step.result(tare=_kept(TareStep, found, noise=noise, frames=count))
+    if not Converter(calibration, step.settings.tactile.pascal_per_count).saturation > 0.0:
+        raise CalibrationError(
+            "tare: most cells are saturated, expected an unloaded tip; check the sensor and "
+            "tactile.full_count"
+        )
     line = (
         f"{count} frames, zero offset up to {found.zero.max():.1f} counts, noise {noise:.2f} counts"
     )
@@ -191,7 +198,7 @@ def _tare(step: Step) -> Done:
     if found.drift > 0.0:
         line += f", common drift of all cells {found.drift:.2f} counts"
     spread = Map("noise, standard deviation [counts]", found.noise)
-    return step.result(tare=result), line, (Map("zero [counts]", found.zero), spread)
+    return calibration, line, (Map("zero [counts]", found.zero), spread)
 
 
 def _refuse_saturation(step: Step) -> None:
@@ -226,6 +233,7 @@ def _curve(step: Step) -> Done:
             )
         # Use the profile's material to compute the force on the whole footprint.
         tip, material = make_tip(step.settings), make_material(step.settings.material)
+        require_covered("curve", tip, d, step.theta)
         pressures = [
             step.plain_grid.pressure(tip, material, float(x), float(theta))
             for x, theta in zip(d, step.theta, strict=True)
@@ -282,7 +290,7 @@ def _modulus(step: Step) -> Done:
     result = _kept(ModulusStep, found)
     d, theta, force = d[whole], theta[whole], force[whole]
     table = ContactTable.build(tip, Material.constant(found.modulus))
-    model = table(d - found.offset, theta).force
+    model = table(d - found.offset, theta, edge=True).force
     shown = Points("constant E", "d [mm]", "F [N]", d * 1e3, force, model)
     alone = found.trend.modulus / 1e6
     each = Points("E of each load", "d [mm]", "E [MPa]", found.trend.d * 1e3, alone)
@@ -322,6 +330,8 @@ def _law(step: Step) -> Done:
     if best.trend is not None:
         lines.append(_over_d(best.trend))
     lines += [_told(each) for each in fits[1:]]
+    if not covers(Fingertip(settings.tip.radius, "solid"), d, theta).all():
+        lines.append("solid: not compared: a press exceeds the depth or tilt range of the data")
     steps: dict[str, Any] = {"scales": None}
     wants = tip_settings(best.tip)
     if best.valid > 0.0:
