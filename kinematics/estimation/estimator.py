@@ -20,6 +20,7 @@ from softfinger.kinematics.contact.solid_data import solid_data
 from softfinger.kinematics.estimation.detection import PATCH_LEVEL
 from softfinger.kinematics.estimation.error_budget import NEIGHBOURS, Uncertainty, set_budget
 from softfinger.kinematics.estimation.frame_pipeline import D_MAX, estimate_frame
+from softfinger.kinematics.estimation.gauss_newton import CELLS_MIN
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.estimation.moments import tabulate_moments
 from softfinger.kinematics.estimation.state import SHEAR_X, EstimatorState, new_cells
@@ -200,7 +201,6 @@ _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum values of d/a and sin θ in a spring fit
 # Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
-CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear
 
 
 def cell_centres(

@@ -42,6 +42,8 @@ _ITERATIONS = 20
 _HALVINGS_MAX = 5
 # Prior standard deviation of a solid tip's shear force, relative to its normal force.
 _SHEAR_PRIOR = 0.1
+CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear
+_SPRINGS_CELLS_MIN = 5  # minimum number of cells for estimating a spring tip's contact
 _LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
 _STEP_MARGIN = 1.01  # factor by which a solid-tip fit may exceed the range of the data
 # Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
@@ -321,7 +323,8 @@ def _check_fit(state: EstimatorState, cells: Cells) -> float:
     freedom = max(freedom, 1.0)
     estimate.chi2 = misfit / (variance * freedom + expected)
     excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.cells_per_sample / freedom), 1.0)
-    return variance * excess if fit.counted_cells > 4.0 else -1.0
+    least = CELLS_MIN if state.options.is_solid else _SPRINGS_CELLS_MIN
+    return variance * excess if fit.counted_cells >= least else -1.0
 
 
 @inner_kernel

@@ -331,3 +331,14 @@ def test_strong_noise_is_not_mistaken_for_no_contact(times):
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     found = [estimator(times * NOISE * rng.standard_normal(GRID.shape)).invalid for _ in range(50)]
     assert set(found) <= {Invalid.MODEL_MISMATCH, Invalid.OUTLIERS}
+
+
+def test_too_few_unsaturated_cells_give_no_estimate():
+    """Of the 12 cells within the rim, 4 are unsaturated. The fit has 5 parameters."""
+    grid, rng = SensorGrid(4, 4, 0.008), np.random.default_rng(5)
+    readings = Readings(saturation=80e3)
+    estimator = ContactEstimator(TIPS[0], RUBBER, grid, NOISE, readings=readings)
+    frame = grid.pressure(TIPS[0], RUBBER, 7.9e-3, 0.0, 0.3)
+    for _ in range(20):
+        noisy = np.minimum(frame + NOISE * rng.standard_normal(frame.shape), 80e3)
+        assert estimator(noisy).invalid is Invalid.SATURATED
