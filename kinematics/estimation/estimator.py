@@ -252,7 +252,8 @@ class ContactEstimator:
     Parameters
     ----------
     tip, material, grid
-        Fingertip ("springs" or "solid"), its stress-strain law, and the sensor.
+        Fingertip ("springs" or "solid"), its stress-strain law, and the sensor. The sensor must
+        have at least two rows and two columns.
     noise
         Standard deviation of a cell's noise [Pa].
     free_gain
@@ -300,6 +301,12 @@ class ContactEstimator:
             raise ValueError(
                 "this class can't estimate the contact of a measured tip: use "
                 "softfinger.kinematics.estimation.measured.MeasuredEstimator"
+            )
+        if min(grid.shape) < 2:
+            # Tilts of opposite sign across a single line of cells result in nearly equal frames.
+            raise ValueError(
+                "the grid must have at least two rows and two columns, which determine both "
+                f"tilts, got {grid.rows} × {grid.cols}"
             )
         if active is not None and np.shape(active) != grid.shape:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
