@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import math
 import os
 import platform
 import sys
@@ -141,10 +142,13 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:
-    """Convert the rows of all tables to JSON values, and replace NaN with null."""
+    """Convert the rows of all tables to JSON values, and replace NaN and infinity with null."""
     return [
         {"measurement": name, "table": table.title}
-        | {key: None if value != value else value for key, value in row.items()}
+        | {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in row.items()
+        }
         for table in tables
         for row in table.rows
     ]
