@@ -64,6 +64,12 @@ def test_infinite_results_are_stored_as_null(tmp_path, monkeypatch):
     assert row["reported ms"] is None
 
 
+def test_a_selection_without_cases_is_reported(capsys):
+    # The brief benchmark omits the grips with each sensor.
+    assert cli.main(["bench", "robustness", "--brief", "--only", "velostat"]) == 1
+    assert "robustness: --only velostat: no case was run; omit --brief" in capsys.readouterr().err
+
+
 def test_a_failed_measurement_does_not_affect_the_others(canned, monkeypatch, capsys):
     def let_go(brief: bool) -> list[Report]:
         raise Refused("the hand let go")

@@ -132,6 +132,10 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
         more["sweep"] = sweep
     try:
         tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
+        if not tables:
+            raise RuntimeError(
+                f"--only {arguments.only}: no case was run; omit --brief, or increase --trials"
+            )
     # A benchmark may fail, for example because a grip was lost on a busy machine.
     except (RuntimeError, SoftfingerError) as error:
         print(f"bench: {name}: {error}", file=sys.stderr)
