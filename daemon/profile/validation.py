@@ -290,7 +290,8 @@ def _solid_tip_sensor(settings: Settings) -> Iterator[str]:
         return
     from softfinger.daemon.profile.factory import make_grid, make_tip
     from softfinger.kinematics.estimation.error_budget import Uncertainty
-    from softfinger.kinematics.estimation.estimator import CELLS_MIN, cells_within_rim
+    from softfinger.kinematics.estimation.estimator import cells_within_rim
+    from softfinger.kinematics.estimation.gauss_newton import CELLS_MIN
 
     known = Uncertainty(centre=tactile.centre_error, pitch=tactile.pitch_error)
     cells = cells_within_rim(make_grid(settings), make_tip(settings), known).sum()

@@ -75,7 +75,8 @@ def find_kernel_folder() -> OwnFolder:
     folder = OwnFolder(path)
     os.utime(folder.path)  # The new time marks the folder as used, so that it is not pruned.
     if fresh:
-        _prune(base, path)
+        with contextlib.suppress(FileNotFoundError):  # Another process may prune at the same time.
+            _prune(base, path)
     return folder
 
 

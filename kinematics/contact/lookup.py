@@ -233,23 +233,6 @@ def lookup(tables: Records[Table], d: float, theta: float) -> LookupResult:
 
 
 @kernel
-def lookup_values(
-    tables: Records[Table], d: float, theta: float
-) -> tuple[float, float, float, float, float, float, bool]:
-    """Evaluate :func:`lookup` for Python, which receives a plain tuple faster than a named one."""
-    found = lookup_at(tables[0], d, theta)
-    return (
-        found.force,
-        found.energy,
-        found.force_d,
-        found.force_theta,
-        found.energy_d,
-        found.energy_theta,
-        found.inside,
-    )
-
-
-@kernel
 def lookups(
     tables: Records[Table],
     d: FloatArray,

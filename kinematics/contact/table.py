@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softfinger.kinematics.compiled.layout import FloatArray
 from softfinger.kinematics.contact.closed_form import Fingertip, flatten
-from softfinger.kinematics.contact.lookup import lookup_values, lookups
+from softfinger.kinematics.contact.lookup import lookup, lookups
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.table_build import build, solid_table
 from softfinger.kinematics.contact.table_record import Table
@@ -206,8 +206,8 @@ class ContactTable:
                 inside = within.reshape(shape)
                 return ContactForces(f, u, f_d, f_theta, u_d, u_theta, inside, self.max_error)
             d, theta = depth.item(), tilt.item()
-        found = lookup_values(self.data, d, theta)
-        if not (found[-1] or edge):
+        found = lookup(self.data, d, theta)
+        if not (found.inside or edge):
             self._warn(np.array([d]), np.array([theta]))
         numbers: ContactForces = _numbers(ContactForces, (*found, self.max_error))
         return numbers

@@ -51,6 +51,7 @@ from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 
 __all__ = ["Uncertainty"]
 
+NEIGHBOURS = 2  # number of neighbours on each side for the patterns of tip position and pitch
 _NEIGHBOURS = np.outer((1.0, 2.0, 2.0, 2.0, 1.0), (1.0, 2.0, 2.0, 2.0, 1.0))  # see `detection`
 _NEIGHBOURS[2, 2] = 0.0
 _NOISE_PEAK = 4.5  # maximum reading due to noise alone, in standard deviations

@@ -18,8 +18,9 @@ from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.contact.solid_data import solid_data
 from softfinger.kinematics.estimation.detection import PATCH_LEVEL
-from softfinger.kinematics.estimation.error_budget import Uncertainty, set_budget
+from softfinger.kinematics.estimation.error_budget import NEIGHBOURS, Uncertainty, set_budget
 from softfinger.kinematics.estimation.frame_pipeline import D_MAX, estimate_frame
+from softfinger.kinematics.estimation.gauss_newton import CELLS_MIN
 from softfinger.kinematics.estimation.invalid import REASONS, Invalid
 from softfinger.kinematics.estimation.moments import tabulate_moments
 from softfinger.kinematics.estimation.state import SHEAR_X, EstimatorState, new_cells
@@ -200,7 +201,6 @@ _FINENESS_LINEAR, _FINENESS_NONLINEAR = 22.0, 31.0
 _DEEPEST, _SINE_MAX = 0.95, 3.0 / math.sqrt(10.0)  # maximum values of d/a and sin θ in a spring fit
 # Width of the excluded rim of a solid tip, relative to the radius.
 _RIM_WIDTH = {"bonded": 0.03, "lying": 0.05}
-CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear
 
 
 def cell_centres(
@@ -222,6 +222,11 @@ def cell_centres(
     inside = a * a - x * x - y * y
     height = np.sqrt(np.where(inside > 0.0, inside, near))
     return np.where(touched & active, height, -math.inf).ravel(), x.ravel(), y.ravel()
+
+
+def _range(at: NDArray[np.intp]) -> tuple[int, int]:
+    """Return the half-open range of ascending indices, or (0, 0) if there are none."""
+    return (int(at[0]), int(at[-1]) + 1) if len(at) else (0, 0)
 
 
 def cells_within_rim(grid: SensorGrid, tip: Fingertip, known: Uncertainty) -> NDArray[np.bool_]:
@@ -247,7 +252,8 @@ class ContactEstimator:
     Parameters
     ----------
     tip, material, grid
-        Fingertip ("springs" or "solid"), its stress-strain law, and the sensor.
+        Fingertip ("springs" or "solid"), its stress-strain law, and the sensor. The sensor must
+        have at least two rows and two columns.
     noise
         Standard deviation of a cell's noise [Pa].
     free_gain
@@ -295,6 +301,12 @@ class ContactEstimator:
             raise ValueError(
                 "this class can't estimate the contact of a measured tip: use "
                 "softfinger.kinematics.estimation.measured.MeasuredEstimator"
+            )
+        if min(grid.shape) < 2:
+            # Tilts of opposite sign across a single line of cells result in nearly equal frames.
+            raise ValueError(
+                "the grid must have at least two rows and two columns, which determine both "
+                f"tilts, got {grid.rows} × {grid.cols}"
             )
         if active is not None and np.shape(active) != grid.shape:
             raise ValueError(f"active must have shape {grid.shape}, got {np.shape(active)}")
@@ -347,28 +359,38 @@ class ContactEstimator:
         return f"ContactEstimator: {rows} × {cols} cells, noise {self.noise:g} Pa, {gain} gain"
 
     def _lay_out(self, tip: Fingertip, material: Material, alive: NDArray[np.bool_]) -> None:
-        """Set up the model, the cell arrays, and the window of cells that a contact can press."""
+        """Set up the model, the cell arrays, and the window of cells that a contact can press.
+
+        At the edges of a sensor that is smaller than the tip, the window includes cells beyond the
+        sensor. They are unused, but the error budget compares each cell with these neighbours.
+        """
         grid, state, options = self.grid, self.state, self.state.options
         radius = tip.radius + 3.0 * grid.blur
-        reach = cell_centres(grid.on(tip), alive, radius)[0] >= 0.0
-        rows, cols = (np.flatnonzero(reach.reshape(grid.shape).any(axis=k)) for k in (1, 0))
-        self._window = slice(0, 0), slice(0, 0)
-        if len(rows):
-            self._window = slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
-        alive = alive[self._window]
-        window = grid.on(tip)
-        window.x += window.pitch_x * self._window[1].start
-        window.y += window.pitch_y * self._window[0].start
+        wide = np.pad(alive, NEIGHBOURS, mode="edge")
+        beyond = replace(grid, rows=wide.shape[0], cols=wide.shape[1])
+        window = beyond.on(tip)
+        reached = cell_centres(window, wide, radius)[0].reshape(wide.shape) >= 0.0
+        top, bottom = _range(np.flatnonzero(reached.any(axis=1)))
+        left, right = _range(np.flatnonzero(reached.any(axis=0)))
+        within = slice(top, bottom), slice(left, right)
+        alive = np.pad(alive, NEIGHBOURS)[within]
+        window.x += window.pitch_x * left
+        window.y += window.pitch_y * top
         window.rows, window.cols = alive.shape
         state.grid.assign(window)
         self._frame = np.zeros(alive.shape)
         self._flat = self._frame.reshape(-1)
+        # The part of the sensor in the window, and its place in ``_frame``.
+        top, bottom, left, right = (at - NEIGHBOURS for at in (top, bottom, left, right))
+        self._window = slice(max(top, 0), max(bottom, 0)), slice(max(left, 0), max(right, 0))
+        rows, cols = np.empty(grid.shape)[self._window].shape
+        self._inside = self._frame[max(-top, 0) :, max(-left, 0) :][:rows, :cols]
         cells = self._cells = new_cells(*alive.shape)
         cells.reach[:], cells.x[:], cells.y[:] = cell_centres(window, alive, radius)
         options.number = int(np.count_nonzero(cells.reach >= 0.0))
         pixels, weights = np.zeros((0, 0)), Weights()
         if options.is_solid:
-            images = grid.images(tip).reshape(-1, *grid.shape)[:, *self._window]
+            images = beyond.images(tip).reshape(-1, *wide.shape)[:, *within]
             images = images.reshape(-1, alive.size)
             pixels, cells.sensitivity[SHEAR_X:] = pixels_of(images[:-2]), images[-2:]
             weights = weights_of(tip, material)
@@ -385,7 +407,8 @@ class ContactEstimator:
         pattern = self.grid.images(tip)[0].reshape(self.grid.shape) * alive
         pattern = np.where(alive, pattern - pattern.sum() / alive.sum(), 0.0)
         pattern /= math.sqrt((pattern**2).sum())
-        self._cells.pattern[:] = pattern[self._window].ravel()
+        self._inside[...] = pattern[self._window]
+        self._cells.pattern[:] = self._flat
         return np.asarray(pattern)
 
     def _smallest_detectable_d(self, tip: Fingertip, material: Material) -> float:
@@ -465,7 +488,7 @@ class ContactEstimator:
         saturation = full if self.saturation is None else self.saturation
         # Copy the frame. The compiled code requires a fixed type and memory layout, and a writable
         # array.
-        self._frame[...] = frame[self._window]
+        self._inside[...] = frame[self._window]
         step = self._quantum if full == math.inf else pascal_per_count
         estimate_frame(
             self.state.array, self._flat, float(pascal_per_count), float(step), float(saturation),

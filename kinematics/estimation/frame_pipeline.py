@@ -213,7 +213,7 @@ def _reset_results(state: EstimatorState, scale: float, step: float, saturation:
     signal.floor = options.floor * scale if step > 0.0 or options.floor > 0.0 else -math.inf
     signal.patch_level = options.patch_level + (CLIPPED_LEVEL_INCREASE if step > 0.0 else 0.0)
     # A contact that is no wider than a cell causes a strain of at most about pitch²/(2a²). The
-    # maximum reading allows for a gain of up to 3.
+    # maximum reading allows for a gain of up to 12.
     pitch = max(grid.pitch_x, grid.pitch_y)
     signal.narrow_contact_max = 6.0 * options.modulus * (pitch / grid.radius) ** 2 / scale
     estimate = state.estimate

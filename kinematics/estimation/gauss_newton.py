@@ -42,7 +42,10 @@ _ITERATIONS = 20
 _HALVINGS_MAX = 5
 # Prior standard deviation of a solid tip's shear force, relative to its normal force.
 _SHEAR_PRIOR = 0.1
+CELLS_MIN = 9  # minimum number of cells for estimating a solid tip's contact and shear
+_SPRINGS_CELLS_MIN = 5  # minimum number of cells for estimating a spring tip's contact
 _LIMITED_MAX = 4  # maximum number of consecutive steps clamped to the limits of the model
+_LOG_STEP_MAX = 2.0  # maximum step of the logarithm of d or of the gain
 _STEP_MARGIN = 1.01  # factor by which a solid-tip fit may exceed the range of the data
 # Minimum pivot of a scaled normal matrix. For a 2 × 2 matrix, the pivot is the determinant divided
 # by the product of the diagonal elements. The rounding error of a pivot is 1e-12.
@@ -271,6 +274,12 @@ def _apply_step(state: EstimatorState) -> bool:
     for i in range(PARAMETERS):
         fit.previous[i] = contact[i]
         contact[i] += fit.step[i]
+    if options.is_solid and options.free_gain:
+        # A frame determines the product of gain and force much better than the factors, and the
+        # force is nearly a power of d. Steps in the logarithms preserve the product.
+        for i in range(GAIN, TILT_X):
+            relative = fit.step[i] / fit.previous[i]
+            contact[i] = fit.previous[i] * math.exp(min(relative, _LOG_STEP_MAX))
     contact[GAIN] = max(contact[GAIN], 0.2 * fit.previous[GAIN])
     tilt = math.hypot(contact[TILT_X], contact[TILT_Y])
     margin = _STEP_MARGIN if options.is_solid else 1.0
@@ -321,7 +330,8 @@ def _check_fit(state: EstimatorState, cells: Cells) -> float:
     freedom = max(freedom, 1.0)
     estimate.chi2 = misfit / (variance * freedom + expected)
     excess = max(estimate.chi2 - 3.0 * math.sqrt(2.0 * budget.cells_per_sample / freedom), 1.0)
-    return variance * excess if fit.counted_cells > 4.0 else -1.0
+    least = CELLS_MIN if state.options.is_solid else _SPRINGS_CELLS_MIN
+    return variance * excess if fit.counted_cells >= least else -1.0
 
 
 @inner_kernel
@@ -390,8 +400,12 @@ def fit(
         cost = linearise(state, model, frame, cells)
         if iteration > 0 and not cost <= before + variance and halvings < _HALVINGS_MAX:
             # Halve the step, because the cost has increased.
+            in_logarithms = state.options.is_solid and state.options.free_gain
             for i in range(PARAMETERS):
-                fit.contact[i] = 0.5 * (fit.contact[i] + fit.previous[i])
+                if in_logarithms and i < TILT_X:
+                    fit.contact[i] = math.sqrt(fit.contact[i] * fit.previous[i])
+                else:
+                    fit.contact[i] = 0.5 * (fit.contact[i] + fit.previous[i])
             halvings += 1
             continue
         before = cost

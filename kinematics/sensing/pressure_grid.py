@@ -115,7 +115,7 @@ class SensorGrid:
         """Return the pressure [Pa] of a contact, averaged over each cell.
 
         For a spring tip, the error is at most 1e-5 of the modulus, even in cells at the outline.
-        The error increases to 1e-4 for tilts above 30°, and to 1e-3 where the outline almost
+        The error increases to 1e-4 for tilts above 30°, and to 2e-3 where the outline almost
         reaches the rim. For a solid tip, the accuracy is that of `solid_data`. Contacts outside the
         range of these data are clamped to the range.
 

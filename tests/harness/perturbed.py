@@ -70,7 +70,7 @@ class Perturbation:
         for module, names in _PRODUCT.items():
             self._wrap(importlib.import_module(module), names, self._moving)
         table = importlib.import_module(_TABLE)
-        self._wrap(table, "lookup_values", self._moving)
+        self._wrap(table, "lookup", self._moving)
         self._wrap(table, "lookups", self._moving_out)
         self._wrap(importlib.import_module(_PLANT), "SimulatedHand.__init__", self._moving_plant)
 

@@ -175,6 +175,25 @@ def test_the_folder_is_private_and_the_least_recently_used_ones_are_removed(pack
     assert f"{package.cache}: other users can write to it (0777): chmod go-w" in told
 
 
+def test_two_processes_may_remove_old_folders_at_the_same_time(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    old = tmp_path / "kernels-0000000000000000"
+    old.mkdir()
+    is_link = Path.is_symlink
+
+    def found(path: Path) -> bool:
+        """Return the result after another process has removed the folder."""
+        result = is_link(path)
+        if path == old and old.exists():
+            old.rmdir()
+        return result
+
+    monkeypatch.setattr(Path, "is_symlink", found)
+    with kernel_folder.find_kernel_folder() as folder:
+        assert folder.path.parent == tmp_path
+    assert not old.exists()
+
+
 def flipped(file: Path) -> None:
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1

@@ -54,6 +54,22 @@ def test_results_are_stored(canned, tmp_path, capsys):
     assert "tick: pipeline alone" in capsys.readouterr().out, "results must be printed"
 
 
+def test_infinite_results_are_stored_as_null(tmp_path, monkeypatch):
+    never = reflex.row("x", [reflex.Overload(math.inf, 0.0, lost=True, said=math.inf)])
+    assert never["reported ms"] == math.inf
+    monkeypatch.setattr(tick, "measure", lambda brief: [Report("tick", [never])])
+    file = tmp_path / "found.json"
+    assert cli.main(["bench", "tick", "--json", str(file)]) == 0
+    (row,) = json.loads(file.read_text(encoding="utf-8"), parse_constant=pytest.fail)["rows"]
+    assert row["reported ms"] is None
+
+
+def test_a_selection_without_cases_is_reported(capsys):
+    # The brief benchmark omits the grips with each sensor.
+    assert cli.main(["bench", "robustness", "--brief", "--only", "velostat"]) == 1
+    assert "robustness: --only velostat: no case was run; omit --brief" in capsys.readouterr().err
+
+
 def test_a_failed_measurement_does_not_affect_the_others(canned, monkeypatch, capsys):
     def let_go(brief: bool) -> list[Report]:
         raise Refused("the hand let go")

@@ -15,7 +15,7 @@ from softfinger.daemon.profile.settings import Settings
 from softfinger.kinematics.contact.closed_form import Fingertip
 from softfinger.kinematics.contact.material import Material
 from softfinger.kinematics.estimation.error_budget import Uncertainty
-from softfinger.kinematics.estimation.estimator import ContactEstimator
+from softfinger.kinematics.estimation.estimator import ContactEstimate, ContactEstimator
 from softfinger.kinematics.sensing.pressure_grid import SensorGrid
 from softfinger.tools.benchmarks.rigs import SOLID, merged
 from tests.harness.paper_tip import LINEAR, NOISE, PITCH, TIP, tilts
@@ -88,6 +88,27 @@ def test_systematic_errors_are_reported_separately_and_default_to_zero():
     np.testing.assert_allclose(shifted.covariance - shifted.systematic, plain.covariance, rtol=1e-3)
     # An offset of the tip has the same effect as a rotation about the tip's centre.
     assert math.sqrt(shifted.systematic[2, 2]) == pytest.approx(5e-4 / 0.019, rel=0.05)
+
+
+@pytest.mark.parametrize("shape", [(12, 12), (3, 16), (16, 8)])
+@pytest.mark.parametrize("free_gain", [True, False])
+def test_the_error_of_the_tip_position_is_known_if_the_footprint_exceeds_the_sensor(
+    shape, free_gain
+):
+    """The footprint, 29 mm wide, reaches beyond the sensor on at least two sides."""
+    grid, step, truth = SensorGrid(*shape, 0.002), 1e-4, (0.006, 0.2, 0.1)
+
+    def found(x: float, y: float, known: Uncertainty | None = None) -> ContactEstimate:
+        frame = replace(grid, centre=(x, y)).pressure(TIP, LINEAR, *truth)
+        return ContactEstimator(TIP, LINEAR, grid, 1.0, free_gain=free_gain, known=known)(frame)
+
+    variance = np.zeros(2)
+    for x, y in ((step, 0.0), (0.0, step)):
+        right, left = found(x, y), found(-x, -y)
+        off = right.tilt_x - left.tilt_x, right.tilt_y - left.tilt_y
+        variance += (0.5 * np.array(off)) ** 2
+    expected = found(0.0, 0.0, Uncertainty(centre=step)).systematic[[1, 2], [1, 2]]
+    np.testing.assert_allclose(np.sqrt(expected), np.sqrt(variance), rtol=0.1)
 
 
 def test_correlated_noise_causes_no_false_contact_and_no_misfit():

@@ -130,6 +130,19 @@ def test_the_estimate_reaches_its_bound_for_any_shear(tip, counts):
     assert 0.7 < np.mean(squares) < 1.4
 
 
+@every
+@pytest.mark.parametrize("theta", [0.15, 0.3, 0.5])
+def test_a_fit_with_a_free_gain_converges_from_a_single_frame(tip, theta):
+    estimator = ContactEstimator(tip, RUBBER, GRID, NOISE, free_gain=True)
+    for d, gain, azimuth in ((2e-3, 1.0, 0.5), (2e-3, 1.6, 3), (3e-3, 0.6, 4.1), (5e-3, 0.6, 2)):
+        tilt_x = math.asin(math.sin(theta) * math.cos(azimuth))
+        tilt_y = math.asin(math.sin(theta) * math.sin(azimuth))
+        found = estimator(GRID.pressure(tip, RUBBER, d, tilt_x, tilt_y, gain))
+        assert found.valid
+        assert abs(found.d - d) < 0.5 * found.d_std
+        assert (found.tilt_x, found.tilt_y) == pytest.approx((tilt_x, tilt_y), abs=0.01)
+
+
 def test_a_sensor_smaller_than_the_tip_estimates_the_contact():
     tip, grid = TIPS[0], SensorGrid(16, 16, 1.5e-3)
     found = ContactEstimator(tip, RUBBER, grid, NOISE)(grid.pressure(tip, RUBBER, 3e-3, 0.1))
@@ -331,3 +344,14 @@ def test_strong_noise_is_not_mistaken_for_no_contact(times):
     estimator = ContactEstimator(TIPS[0], RUBBER, GRID, NOISE)
     found = [estimator(times * NOISE * rng.standard_normal(GRID.shape)).invalid for _ in range(50)]
     assert set(found) <= {Invalid.MODEL_MISMATCH, Invalid.OUTLIERS}
+
+
+def test_too_few_unsaturated_cells_give_no_estimate():
+    """Of the 12 cells within the rim, 4 are unsaturated. The fit has 5 parameters."""
+    grid, rng = SensorGrid(4, 4, 0.008), np.random.default_rng(5)
+    readings = Readings(saturation=80e3)
+    estimator = ContactEstimator(TIPS[0], RUBBER, grid, NOISE, readings=readings)
+    frame = grid.pressure(TIPS[0], RUBBER, 7.9e-3, 0.0, 0.3)
+    for _ in range(20):
+        noisy = np.minimum(frame + NOISE * rng.standard_normal(frame.shape), 80e3)
+        assert estimator(noisy).invalid is Invalid.SATURATED

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import math
 import os
 import platform
 import sys
@@ -131,6 +132,10 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
         more["sweep"] = sweep
     try:
         tables = _module(name).measure(brief=arguments.brief or not arguments.names, **more)
+        if not tables:
+            raise RuntimeError(
+                f"--only {arguments.only}: no case was run; omit --brief, or increase --trials"
+            )
     # A benchmark may fail, for example because a grip was lost on a busy machine.
     except (RuntimeError, SoftfingerError) as error:
         print(f"bench: {name}: {error}", file=sys.stderr)
@@ -141,10 +146,13 @@ def _measured(name: str, arguments: argparse.Namespace) -> list[Report]:
 
 
 def _kept(name: str, tables: list[Report]) -> list[Row]:
-    """Convert the rows of all tables to JSON values, and replace NaN with null."""
+    """Convert the rows of all tables to JSON values, and replace NaN and infinity with null."""
     return [
         {"measurement": name, "table": table.title}
-        | {key: None if value != value else value for key, value in row.items()}
+        | {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in row.items()
+        }
         for table in tables
         for row in table.rows
     ]
