@@ -316,6 +316,8 @@ def _tactile(settings: Settings) -> Iterator[str]:
                     f"tactile.dead: found {shown(cell)} for {name}, expected a cell in "
                     f"the grid of {tactile.rows} × {tactile.cols} cells"
                 )
+        if len(set(cells)) >= tactile.rows * tactile.cols:
+            yield f"tactile.dead: found all cells for {name}, expected at least one working cell"
     yield from _blur(settings)
     if tactile.backend == "replay":
         yield from _missing(settings, "recording", "the path of a recording")

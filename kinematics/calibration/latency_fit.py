@@ -69,8 +69,8 @@ def fit_latency(
     Raises
     ------
     CalibrationError
-        If the joints close by less than 0.8 mm in every ramp, or if the data are longer than an
-        hour.
+        If the joints close by less than 0.8 mm in every ramp, if the latency exceeds 0.2 s, or if
+        the data are longer than an hour.
     """
     t, d, std = (np.asarray(each, np.float64) for each in frames)
     read, closed = (np.asarray(each, np.float64) for each in joints)
@@ -127,6 +127,11 @@ def _fit(
     delays = np.arange(_DELAY_MIN, _DELAY_MAX, _STEP) - latency
     costs = np.array([float(np.sum(np.square(solve(delay)[1]))) for delay in delays])
     best = int(np.argmin(costs))
+    if best == delays.size - 1:
+        raise CalibrationError(
+            f"found a latency of at least {_DELAY_MAX * 1e3:g} ms, which cannot be measured; check "
+            "the board's rate and baud rate"
+        )
     near = slice(max(best - 5, 0), best + 6)
     bend, slope, _ = np.polyfit(delays[near] - delays[best], costs[near], 2)
     delay, bend = float(delays[best]), max(float(bend), 1e-9)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from softfinger import ContactTable, Fingertip, Material, SensorGrid
-from softfinger.daemon.perception.calibration_file import load_calibration
+from softfinger.daemon.perception.calibration_file import load_calibration, save_calibration
 from softfinger.kinematics.calibration.calibration import CalibrationError
 from softfinger.kinematics.calibration.press_fit import (
     Presses,
@@ -15,6 +15,7 @@ from softfinger.kinematics.calibration.press_fit import (
     fit_centre,
     fit_modulus,
 )
+from softfinger.kinematics.contact.tip_curves import TipCurves
 from softfinger.tools.cli import main
 
 GRID = SensorGrid(32, 32, 0.058 / 32)
@@ -158,6 +159,28 @@ def test_calibrate_law_names_the_tip_model(tmp_path, capsys):
         'tip.physics = "solid", tip.base = "bonded", tip.face = "frictionless", tip.poisson = 0.4'
     )
     assert f"for the profile: {profile}" in told
-    modulus = load_calibration(tmp_path / "left.json").modulus
-    assert load_calibration(tmp_path / "left.json").wants["physics"] == "solid"
-    assert modulus.modulus == pytest.approx(0.25e6, rel=0.05)
+    found = load_calibration(tmp_path / "left.json")
+    assert found.wants["physics"] == "solid"
+    assert found.modulus.modulus == pytest.approx(0.25e6, rel=0.05)
+    # Curves of an earlier run do not remain if the presses do not determine curves.
+    cubic = ((0.0, 0.0, 0.0),) * 3 + ((1.0, 0.0, 0.0),) + ((0.0, 0.0, 0.0),) * 2
+    square = ((0.0,) * 4,) * 4
+    curves = TipCurves(
+        0.02,
+        4e-3,
+        0.3,
+        cubic,
+        cubic,
+        cubic,
+        cubic,
+        (0.0, 0.0),
+        0.0,
+        (0.0,) * 4,
+        square,
+        0.0,
+        0.0,
+        6,
+    )
+    save_calibration(tmp_path / "left.json", found.model_copy(update={"law": curves}))
+    assert main(words) == 0
+    assert load_calibration(tmp_path / "left.json").law is None

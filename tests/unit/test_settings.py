@@ -281,6 +281,11 @@ def test_an_unknown_model_is_reported_with_all_other_errors(tmp_path):
         ("[loop]\nrate = 1979-05-27", "loop.rate: found 1979-05-27, expected a valid number"),
         ('"\\u001b[31m" = 1', "?[31m: unknown key"),
         (
+            "[tactile]\nrows = 4\ncols = 4\ndead = [[], "
+            f"{[[i, j] for i in range(4) for j in range(4)]}]",
+            "tactile.dead: found all cells for right, expected at least one",
+        ),
+        (
             "[safety]\nframe_age_hold = 20.0",
             "safety.frame_age_hold: found 20, expected less than",
         ),

@@ -332,7 +332,7 @@ def _law(step: Step) -> Done:
     lines += [_told(each) for each in fits[1:]]
     if not covers(Fingertip(settings.tip.radius, "solid"), d, theta).all():
         lines.append("solid: not compared: a press exceeds the depth or tilt range of the data")
-    steps: dict[str, Any] = {"scales": None}
+    steps: dict[str, Any] = {"scales": None, "law": None}
     wants = tip_settings(best.tip)
     if best.valid > 0.0:
         strain = [] if best.law.is_linear else np.linspace(0.05, 1.0, 20).tolist()
