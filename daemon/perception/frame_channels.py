@@ -85,7 +85,8 @@ class Scan(NamedTuple):
     rotation: float  # object rotation since the scan [rad]
     d_rate: float  # at the scan [m/s]
     theta_rate: float  # at the scan [rad/s]
-    pending: float  # standard deviation of d due to recent motion [m]
+    pending_d: float  # standard deviation of d due to recent motion [m]
+    pending_tilt: float  # standard deviation of the tilt due to recent motion [rad]
     relaxation: float  # relaxation factor
 
 
@@ -93,7 +94,8 @@ class FingerMotion(NamedTuple):
     """Predicted motion of one finger, accumulated up to a given time."""
 
     d: float
-    pending: float
+    pending_d: float
+    pending_tilt: float
     angle: float
     q: float
     relaxation: float
@@ -126,7 +128,8 @@ def _motion_at(history: Records[HistoryRow], newest: int, t: float, finger: int)
     last = history[after]
     return FingerMotion(
         interpolate(first.d[finger], last.d[finger], fraction),
-        interpolate(first.pending[finger], last.pending[finger], fraction),
+        interpolate(first.pending_d[finger], last.pending_d[finger], fraction),
+        interpolate(first.pending_tilt[finger], last.pending_tilt[finger], fraction),
         interpolate(first.angle, last.angle, fraction),
         interpolate(first.q[finger], last.q[finger], fraction),
         interpolate(first.relaxation[finger], last.relaxation[finger], fraction),
@@ -171,7 +174,8 @@ def _motion_since(h: HandFilter, history: Records[HistoryRow], finger: int, t: f
         h.rotation - row.angle,
         d_rate,
         theta_rate,
-        row.pending,
+        row.pending_d,
+        row.pending_tilt,
         row.relaxation,
     )
 
@@ -235,10 +239,12 @@ def update(
     if is_new_contact:
         _begin_contact(h, finger, face + scan.rotation)
         reset(h, D + finger, d + scan.d, h.radius * h.radius)
+    # All frames within `settling_time` have similar errors, so they count as one measurement.
+    alike = max(h.frame_rate * settling_time(h), 1.0)
+    theta_noise += scan.pending_tilt * scan.pending_tilt * alike
     pending_variance = 0.0
     if shows_d:  # Otherwise, only frames during motion separate d from the gain.
-        # All frames within `settling_time` have similar errors, so they count as one measurement.
-        pending_variance = scan.pending * scan.pending * max(h.frame_rate * settling_time(h), 1.0)
+        pending_variance = scan.pending_d * scan.pending_d * alike
     d_noise += pending_variance
     d_at_scan = h.mean[D + finger] - scan.d
     angle_at_scan = h.mean[ANGLE] - 0.5 * sense * h.mean[TAPER] - scan.rotation

@@ -112,7 +112,9 @@ class HistoryRow(Record):
 
     t: float
     d: Pair
-    pending: Pair  # standard deviation of d in a frame due to recent motion [m]
+    # Standard deviations of a frame due to recent motion
+    pending_d: Pair  # [m]
+    pending_tilt: Pair  # [rad]
     angle: float
     q: Pair
     relaxation: Pair
@@ -353,7 +355,9 @@ def _store(h: HandFilter, history: Records[HistoryRow], t: float, dt: float) -> 
         tilt = h.rotation + (1.0 - 2.0 * k) * tip.travel[1]
         tip.delayed[0] = interpolate(tip.travel[0], tip.delayed[0], settling)
         tip.delayed[1] = interpolate(tilt, tip.delayed[1], settling)
-        row.pending[k] = _pending(h, tip.travel[0] - tip.delayed[0], tilt - tip.delayed[1])
+        row.pending_d[k], row.pending_tilt[k] = _pending(
+            h, tip.travel[0] - tip.delayed[0], tilt - tip.delayed[1]
+        )
         row.q[k] = interpolate(tip.travel[1], last.q[k], smoothing)
         row.relaxation[k] = interpolate(tip.relaxation, last.relaxation[k], smoothing)
 
@@ -370,17 +374,19 @@ def settling_time(h: HandFilter) -> float:
 
 
 @inner_kernel
-def _pending(h: HandFilter, closing: float, tilting: float) -> float:
-    """Return the standard deviation of d [m] in a frame due to motion within `settling_time`.
+def _pending(h: HandFilter, closing: float, tilting: float) -> FloatPair:
+    """Return the standard deviations of d [m] and of the tilt [rad] in a frame due to motion.
 
-    A frame may lack an unknown part of a change ``closing`` in d [m]. Changes below the velocity
-    resolution are ignored. If the tip rolls by ``tilting`` [rad], the pressure image smears by s =
-    R ``tilting``, where R is the tip radius. Its mean square radius, which is 2Rd/3 for a parabolic
-    pressure distribution, then increases by s². Therefore, d appears to be larger by 1.5 s²/R.
+    A frame may lack an unknown part of the motion within `settling_time`, a change ``closing`` in d
+    [m] and ``tilting`` in the tilt [rad]. Motion below the velocity resolution is ignored. If the
+    tip rolls by ``tilting``, the pressure image smears by s = R ``tilting``, where R is the tip
+    radius. Its mean square radius, which is 2Rd/3 for a parabolic pressure distribution, then
+    increases by s². Therefore, d appears to be larger by 1.5 s²/R.
     """
-    resolution = h.velocity_unit * h.length * settling_time(h)
+    resolution = h.velocity_unit * settling_time(h)
     smear = 1.5 * h.radius * tilting * tilting
-    return math.hypot(max(abs(closing) - resolution, 0.0), smear)
+    d_std = math.hypot(max(abs(closing) - resolution * h.length, 0.0), smear)
+    return d_std, max(abs(tilting) - 2.0 * resolution, 0.0)
 
 
 @inner_kernel

@@ -137,6 +137,22 @@ def test_a_jump_in_the_angle_is_an_outlier(jump, rejected):
     assert held.is_rejected == rejected
 
 
+def test_late_frames_of_a_turning_object_do_not_pull_the_angle_back():
+    """If the cells are slow, frames show an angle of the past until the joints have stopped."""
+    held, speed, lag = Held(), 0.3, 0.06
+    held.run(1.0)
+    turning, angle = 0.0, 0.0
+    for tick in range(30):
+        rate = speed * sum(held.grasp.rolling_ratio)
+        held.run(0.01, turned=[turning] * 2, dq=(speed, -speed))
+        angle += 0.01 * rate
+        # The tilt of a tip is the sum of the object's angle and the joint angle.
+        turning = max(angle - lag * rate, 0.0) - speed * min(lag, 0.01 * (tick + 1))
+    assert angle - held.pose.angle < 0.5 * lag * rate
+    held.run(0.5, turned=[angle] * 2)
+    assert held.pose.angle == pytest.approx(angle, abs=5e-3)
+
+
 @pytest.mark.parametrize(("jump", "rejected"), [(1.6e-3, False), (2.8e-3, True)])
 def test_a_jump_of_a_noisy_sensor_is_an_outlier_only_beyond_five_standard_deviations(
     jump, rejected
