@@ -239,12 +239,10 @@ def update(
     if is_new_contact:
         _begin_contact(h, finger, face + scan.rotation)
         reset(h, D + finger, d + scan.d, h.radius * h.radius)
-    # All frames within `settling_time` have similar errors, so they count as one measurement.
-    alike = max(h.frame_rate * settling_time(h), 1.0)
-    theta_noise += scan.pending_tilt * scan.pending_tilt * alike
     pending_variance = 0.0
     if shows_d:  # Otherwise, only frames during motion separate d from the gain.
-        pending_variance = scan.pending_d * scan.pending_d * alike
+        # All frames within `settling_time` have similar errors, so they count as one measurement.
+        pending_variance = scan.pending_d**2 * max(h.frame_rate * settling_time(h), 1.0)
     d_noise += pending_variance
     d_at_scan = h.mean[D + finger] - scan.d
     angle_at_scan = h.mean[ANGLE] - 0.5 * sense * h.mean[TAPER] - scan.rotation
@@ -263,7 +261,7 @@ def update(
         by_gain = h.prior_variance[GAIN + finger] ** 0.5 / log_slope
         tip.shared_variance[0] = max(systematic[0, 0] - by_gain * by_gain, 0.0)
     tip.has_new_frame = True
-    _update_angle(h, finger, angle_innovation, theta_noise, scan.theta_rate, is_new_contact)
+    _update_angle(h, finger, scan, angle_innovation, theta_noise, is_new_contact)
     tip.in_contact = True
     if tip.gain_is_unknown:
         expected = lookup(table, max(d_at_scan, D_MIN), tilt)
@@ -355,18 +353,20 @@ def _begin_contact(h: HandFilter, finger: int, face: float) -> None:
 def _update_angle(
     h: HandFilter,
     finger: int,
+    scan: Scan,
     innovation: float,
     noise: float,
-    theta_rate: float,
     is_new_contact: bool,
 ) -> None:
     """Update the state with the face angle measured in a frame.
 
-    An innovation beyond the gate indicates that the object has rotated unexpectedly.
+    An innovation beyond the gate indicates that the object has rotated unexpectedly, unless the
+    frame may lack a part of the joint motion.
     """
     before = h.mean[ANGLE] + h.mean[ANGLE_BIAS + finger]
-    _set_angle_slopes(h, finger, theta_rate)
-    if innovation * innovation > GATE * GATE * (predicted_variance(h) + noise):
+    _set_angle_slopes(h, finger, scan.theta_rate)
+    variance = predicted_variance(h) + noise + scan.pending_tilt**2
+    if innovation * innovation > GATE * GATE * variance:
         h.covariance[ANGLE, ANGLE] += innovation * innovation
     correct(h, ANGLE_CHANNEL + finger, innovation, noise, math.inf)
     if not is_new_contact:

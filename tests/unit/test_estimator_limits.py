@@ -148,7 +148,7 @@ def test_late_frames_of_a_turning_object_do_not_pull_the_angle_back():
         angle += 0.01 * rate
         # The tilt of a tip is the sum of the object's angle and the joint angle.
         turning = max(angle - lag * rate, 0.0) - speed * min(lag, 0.01 * (tick + 1))
-    assert angle - held.pose.angle < 0.5 * lag * rate
+    assert angle - held.pose.angle < 0.7 * lag * rate
     held.run(0.5, turned=[angle] * 2)
     assert held.pose.angle == pytest.approx(angle, abs=5e-3)
 
