@@ -40,6 +40,7 @@ class WiringWatch:
         self._force = 0.0  # tip force after the touch [N]
         self._turn = math.nan  # object angle at the start of a rotation [rad]
         self._goal = math.nan  # commanded object angle [rad]
+        self._angle = math.nan  # object angle on the previous tick [rad]
         self._sense = 0.0  # direction of the commanded rotation
 
     def update(self, state: State) -> None:
@@ -83,9 +84,14 @@ class WiringWatch:
 
     def _check_turn(self, state: State) -> None:
         angle, goal = state.object.angle, state.goal.angle
-        # A NaN goal also counts as changed. A streamed goal changes on every tick.
+        # A NaN goal also counts as changed. A streamed goal changes on every tick. If the
+        # controller ends a rotation to prevent slip, the new goal is the object's angle. The goal
+        # then follows an object that rotates in the wrong direction.
         if goal != self._goal:
-            self._goal, self._turn = goal, math.nan
+            if goal != self._angle:
+                self._turn = math.nan
+            self._goal = goal
+        self._angle = angle
         if math.isnan(self._turn):
             if state.object.valid and abs(goal - angle) > 0.5 * _WRONG_ROTATION:
                 self._turn, self._sense = angle, math.copysign(1.0, goal - angle)

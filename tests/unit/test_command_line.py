@@ -45,6 +45,14 @@ def test_the_closest_subcommand_is_suggested(inline):
     assert inline("send").stderr.endswith("required: COMMAND\n")
 
 
+def test_the_fraction_of_a_warning_applies_to_the_limit_and_not_to_its_settings(inline):
+    """The tilt limit is asin(1 − d/a) minus a margin, and only the margin is a setting."""
+    text = inline("limits").stdout
+    assert "at 0.9 × the limit" in text
+    assert "× safety" not in text
+    assert "× object" not in text
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -122,9 +122,14 @@ def test_the_tilt_shows_whose_motion_a_tip_follows_despite_a_light_contact(follo
     assert bool(watch.swapped) == swapped
 
 
-def test_swapped_servos_are_detected_at_the_start_of_a_turn(make):
-    # If the object is centred, swapped servos do not change the approach.
-    daemon = make("swapped")
+# The tips would slip before the object has rotated by 4°, so the controller ends the rotation.
+NEAR = [0.002, 0.003]
+
+
+@pytest.mark.parametrize("off", [0.0, *NEAR])
+def test_swapped_servos_are_detected_at_the_start_of_a_turn(make, off):
+    # If the object is almost centred, swapped servos do not change the approach.
+    daemon = make("swapped", object_position=(off, 0.08))
     command(daemon, "grasp", force=6.0)
     greatest_force(daemon, 2.0)
     assert daemon.loop.state.mode == "holding"

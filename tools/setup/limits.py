@@ -33,9 +33,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _values(settings: Settings, row: Limit) -> list[str]:
-    """Format a limit's settings, each with the fraction at which a violation is reported."""
-    share = "" if row.fraction == 1.0 else f"{row.fraction:g} × "
-    return [f"{share}{key} = {_shown(attrgetter(key)(settings))}" for key in row.keys]
+    """Format a limit's settings, after the fraction of the limit at which a warning is issued."""
+    values = [f"{key} = {_shown(attrgetter(key)(settings))}" for key in row.keys]
+    return values if row.fraction == 1.0 else [f"at {row.fraction:g} × the limit", *values]
 
 
 def _shown(value: Any) -> str:
