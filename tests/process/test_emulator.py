@@ -313,6 +313,8 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
         # If one fault name is invalid, the emulator ignores the whole message.
         assert send(tmp_path, "silent=2 sillent=2") == 1
         assert "'sillent=2'" in capsys.readouterr().err
+        assert send(tmp_path, "\udcff") == 1  # bytes that are not UTF-8
+        assert "fault '?'" in capsys.readouterr().err
         assert SdkServos(tmp_path).ping(2) == 1020
 
 

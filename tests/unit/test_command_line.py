@@ -54,9 +54,10 @@ def test_the_closest_subcommand_is_suggested(inline):
         ("grasp force=nan", "found 'force=nan', expected key=number"),
         ("grasp 5", "found '5', expected key=number"),
         ("gasp", "unknown word 'gasp'; nearest: grasp"),
+        ("arm --client \udcff", r"argument --client: found '\udcff', expected UTF-8 text"),
     ],
 )
-def test_invalid_numbers_are_not_sent(inline, words, said):
+def test_invalid_commands_are_not_sent(inline, words, said):
     done = inline("send", *words.split(), "--timeout", "0.1")
     assert done.returncode == 2
     assert said in done.stderr
