@@ -5,6 +5,7 @@ The pipeline reads the time only from its clock, never directly from the system.
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
 import time
@@ -72,10 +73,15 @@ class Deadline:
 
     def __init__(self, path: Path, create: int = 0) -> None:
         """Map the file at ``path``; ``create`` is `os.O_CREAT` or 0. Raises OSError."""
-        file = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | create, 0o600)
+        self._path = path
+        self._map(create)
+
+    def _map(self, create: int) -> None:
+        file = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | create, 0o600)
         try:
             os.posix_fallocate(file, 0, 8)  # On a full disk, writing to a hole raises SIGBUS.
             self._value = memoryview(mmap.mmap(file, 8)).cast("d")
+            self._inode = os.fstat(file).st_ino
         finally:
             os.close(file)
 
@@ -94,6 +100,9 @@ class Deadline:
 
     @t.setter
     def t(self, t: float) -> None:
+        with contextlib.suppress(OSError):  # The emulator has exited.
+            if self._path.stat().st_ino != self._inode:
+                self._map(0)  # A restarted emulator has created a new file.
         self._value[0] = t
 
 

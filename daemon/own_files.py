@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import socket
 import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, Literal, TextIO
+from typing import Any, BinaryIO, TextIO
 
 from softfinger.kinematics.compiled.own_folder import (
     HAS_OWNERS,
@@ -137,16 +138,27 @@ def free_socket_path(path: Path, kind: socket.SocketKind) -> str:
 def write_text(path: Path, append: bool = False, newline: str | None = None) -> TextIO:
     """Open a UTF-8 text file at a user-specified path for overwriting or appending.
 
-    Raises OSError like `open`. Raises PermissionError if another user owns the path, and
-    the path is a link or lies in a world-writable folder.
+    Raises OSError like `open`, also for failed writes. Raises PermissionError if another user owns
+    the path, and the path is a link or lies in a world-writable folder.
     """
-    mode: Literal["a", "w"] = "a" if append else "w"
-    return open(path, mode, encoding="utf-8", newline=newline, opener=_open)
+    file = io.BufferedWriter(_NamedFile(path, "a" if append else "w", opener=_open))
+    return io.TextIOWrapper(file, encoding="utf-8", newline=newline)
 
 
 def write_bytes(path: Path) -> BinaryIO:
-    """Open a binary file for overwriting, with the same checks as `write_text`."""
-    return open(path, "wb", opener=_open)
+    """Open a binary file for overwriting, with the same checks and errors as `write_text`."""
+    return io.BufferedWriter(_NamedFile(path, "w", opener=_open))
+
+
+class _NamedFile(io.FileIO):
+    """File whose write errors name the file, as the errors of `open` do."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            error.filename = self.name
+            raise
 
 
 def _open(path: str, flags: int) -> int:

@@ -189,7 +189,21 @@ def add_daemon(parser: argparse.ArgumentParser, client: bool = False) -> None:
         help="folder with this client's keys, created by `softfinger keys`",
     )
     if client:
-        parser.add_argument("--client", default="", help="client name, to which the lease is bound")
+        parser.add_argument(
+            "--client",
+            type=_client,
+            default="",
+            help="client name, to which the lease is bound",
+        )
+
+
+def _client(text: str) -> str:
+    """Parse a client name. Raises ArgumentTypeError for bytes that are not UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected UTF-8 text") from None
+    return text
 
 
 def add_stream(parser: argparse.ArgumentParser, client: bool = False) -> None:

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from softfinger.daemon.errors import SoftfingerError
-from softfinger.daemon.own_files import open_regular
+from softfinger.daemon.own_files import open_regular, write_text
 from softfinger.tools.arguments import number
 from softfinger.tools.extras import require
 
@@ -172,7 +172,7 @@ class Sweep(Generic[Case, Result]):
     def _keep(self, k: int, result: Result) -> None:
         self._results[k] = result
         if self._journal is not None:
-            with self._journal.open("a", encoding="utf-8") as file:
+            with write_text(self._journal, append=True) as file:
                 file.write(json.dumps([k, result]) + "\n")
 
     def _take_up(self) -> None:
@@ -181,10 +181,11 @@ class Sweep(Generic[Case, Result]):
             return
         digest = _digest_of(self._work, self._cases)
         if not self._journal.exists():
-            self._journal.write_text(json.dumps(digest) + "\n", encoding="utf-8")
+            with write_text(self._journal) as file:
+                file.write(json.dumps(digest) + "\n")
             return
-        with open_regular(self._journal) as file:
-            lines = file.read().decode("utf-8", "replace").splitlines()
+        with open_regular(self._journal) as journal:
+            lines = journal.read().decode("utf-8", "replace").splitlines()
         if not lines or lines[0] != json.dumps(digest):
             raise SweepError(
                 f"{self._journal}: belongs to another sweep or to another version of softfinger; "

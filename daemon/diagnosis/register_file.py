@@ -54,7 +54,14 @@ class StoredServos(Section):
 
 
 def save_registers(settings: Settings, path: Path) -> list[Finding]:
-    """Save the registers of each servo that replies, except for ID and baud rate."""
+    """Save the registers of each servo that replies, except for ID and baud rate.
+
+    Raises ServoError if the file already exists, because it may be the only copy of older values.
+    """
+    if path.is_file():
+        raise ServoError(
+            f"{path}: already exists; choose another file, or move this file elsewhere"
+        )
     servos: list[StoredServo] = []
     found = []
     with _open(settings) as line:

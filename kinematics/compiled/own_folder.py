@@ -108,8 +108,10 @@ def write_whole(
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path, src_dir_fd=folder, dst_dir_fd=folder)
-    except OSError:
+    except OSError as error:
         _remove(part, folder)
+        if error.filename is None:
+            error.filename = path
         raise
 
 

@@ -179,7 +179,9 @@ class FileTarget:
         try:
             self._read(self._path)
         except self._error as error:
-            return ("refused" if str(error) else "refused without a word"), text
+            if not str(error):
+                raise AssertionError(f"{type(error).__name__} without a message") from error
+            return "refused", text
         return "done", text
 
     def close(self) -> None:

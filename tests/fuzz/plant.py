@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from softfinger.daemon.simulation.physics.plant import step
+from softfinger.daemon.simulation.physics.plant_state import SHEARS
 from softfinger.kinematics.compiled.kernel import kernel
 from tests.fuzz import Report
 from tests.harness.plant import BOUNDED, CURRENT, PAPER, POSITION, TABLE_I, make
@@ -46,7 +47,7 @@ def is_sound(plant):
     total = plant.energy
     for j in range(5):
         total += state.position[j] + state.velocity[j]
-    for j in range(6):
+    for j in range(SHEARS):
         total += state.extra_shear[j]
     for j in range(2):
         each = felt[j]

@@ -120,6 +120,11 @@ def test_registers_are_stored_before_a_change_and_restored(hands, capsys, tmp_pa
     assert status == 0, lines
     assert f"note   servo 1 (left): 29 registers saved to {path}" in lines
     assert [memory[: reg.RAM] for memory in hand.registers()] != before
+    saved = path.read_text()
+    status, lines = hand.doctor(capsys, "--save", str(path), "--fix")
+    assert status == 1
+    assert f"servos: {path}: already exists; " in "".join(with_status(lines, "FAIL"))
+    assert path.read_text() == saved
     for servo in hand.emulator._servos.bus.servos:
         servo.table.set(reg.GOAL_PWM, 500)
         servo.table.set(reg.BUS_WATCHDOG, 255)  # The watchdog has stopped the servo.

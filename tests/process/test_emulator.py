@@ -201,14 +201,20 @@ def test_a_full_disk_is_an_error_of_the_deadline_instead_of_a_crash(monkeypatch,
     assert Deadline.of(str(tmp_path / "servos")) is None
 
 
+@pytest.mark.parametrize("restarts", [False, True])
 @pytest.mark.parametrize("late", [0.0005, 0.004, 0.03, 5.0])
-def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path, late):
+def test_emulated_time_is_synchronised_with_a_late_daemon(monkeypatch, tmp_path, late, restarts):
     machine = LateMachine(100.0)
     monkeypatch.setattr(module.time, "monotonic", machine.now)
     clock = EmulatorClock(Deadline(tmp_path / Deadline.NAME, os.O_CREAT))
     servos = Mock(driven=lambda: driven, answering_until=0.0)
     clock.servos, driven = servos, True
     daemon = HandClock(machine, Deadline.of(str(tmp_path / "servos")))
+    if restarts:  # An emulator that exits removes the file, and its successor creates a new file.
+        (tmp_path / Deadline.NAME).unlink()
+        daemon.sleep_until(100.0)
+        clock = EmulatorClock(Deadline(tmp_path / Deadline.NAME, os.O_CREAT))
+        clock.servos = servos
     apart = []
     for k in range(200):
         daemon.sleep_until(100.0 + 0.002 * k)
@@ -307,6 +313,8 @@ def test_faults_are_injected_at_run_time(tmp_path, capsys):
         # If one fault name is invalid, the emulator ignores the whole message.
         assert send(tmp_path, "silent=2 sillent=2") == 1
         assert "'sillent=2'" in capsys.readouterr().err
+        assert send(tmp_path, "\udcff") == 1  # bytes that are not UTF-8
+        assert "fault '?'" in capsys.readouterr().err
         assert SdkServos(tmp_path).ping(2) == 1020
 
 

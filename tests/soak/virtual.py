@@ -8,8 +8,8 @@ checks of each requirement, and fails if a requirement is never checked. The tes
 few sequences.
 
 ``--ticks 14400000`` runs one hand for eight hours of virtual time and records the stream.
-Violations are counted and do not end the run. The run fails if memory grows or a state is
-inconsistent.
+Violations are counted and do not end the run. The run fails if memory grows, or if a requirement
+other than those on forces and reported channels is violated.
 """
 
 import argparse
@@ -106,6 +106,8 @@ ASSERTIONS = (
     *STOPPED.values(), OFF, WATCHDOG, STAYS, GOAL, READING, FRAME, STATE, CALM, LIED, RAISED,
     MOST, *HONEST.values(), LOADED, *NAMED.values(),
 )  # fmt: skip
+# Requirements that a long sequence may violate in a few ticks.
+_TOLERATED = {CALM, LIED, RAISED, MOST, *HONEST.values(), LOADED, *NAMED.values()}
 
 
 class Judge:
@@ -772,8 +774,7 @@ def main() -> int:
     account.seconds = time.monotonic() - begin
     print("\n".join(account.lines()))
     few = account.held < HELD * account.sequences
-    # A long sequence may contain a few force violations.
-    broken = account.failures or account.broken[STATE]
+    broken = account.failures or account.broken.keys() - _TOLERATED
     return 1 if broken or account.never or few or account.growth > _FLAT else 0
 
 

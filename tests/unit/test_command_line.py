@@ -62,9 +62,10 @@ def test_the_fraction_of_a_warning_applies_to_the_limit_and_not_to_its_settings(
         ("grasp force=nan", "found 'force=nan', expected key=number"),
         ("grasp 5", "found '5', expected key=number"),
         ("gasp", "unknown word 'gasp'; nearest: grasp"),
+        ("arm --client \udcff", r"argument --client: found '\udcff', expected UTF-8 text"),
     ],
 )
-def test_invalid_numbers_are_not_sent(inline, words, said):
+def test_invalid_commands_are_not_sent(inline, words, said):
     done = inline("send", *words.split(), "--timeout", "0.1")
     assert done.returncode == 2
     assert said in done.stderr

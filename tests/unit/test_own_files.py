@@ -75,6 +75,14 @@ def test_own_files_and_links_are_written_normally(shared):
         nothing.write(b"x")
 
 
+@pytest.mark.parametrize("write", [write_text, write_bytes])
+def test_an_error_during_writing_names_the_file(write):
+    file = write(Path("/dev/full"))
+    file.write("x" if write is write_text else b"x")
+    with pytest.raises(OSError, match=r"No space left on device: .*/dev/full"):
+        file.close()
+
+
 def test_a_file_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
     file = tmp_path / "kept"
     own_folder.write_whole(file, b"before")
@@ -83,7 +91,7 @@ def test_a_file_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(own_folder.os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match=f"No space left on device: .*{file}"):
         own_folder.write_whole(file, b"after")
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("kept", b"before")]
 

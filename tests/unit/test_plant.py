@@ -8,10 +8,10 @@ import pytest
 from softfinger import ContactTable, Fingertip, Material
 from softfinger.daemon.simulation.physics.contacts import touch_object
 from softfinger.daemon.simulation.physics.forces import place_finger
-from softfinger.daemon.simulation.physics.plant_state import TipContact
+from softfinger.daemon.simulation.physics.plant_state import SHEARS, TipContact
 from softfinger.daemon.simulation.physics.simulated_hand import SimulatedHand
 from softfinger.kinematics.compiled.kernel import kernel
-from tests.fuzz.plant import abuse, random_hand
+from tests.fuzz.plant import abuse, is_sound, random_hand
 from tests.harness.plant import MODULUS, PAPER, TABLE_I, make, place
 
 # Single tip.
@@ -176,6 +176,14 @@ def sheared(hand: SimulatedHand, way: list[float]) -> list[float]:
             hand.advance(hand.t + STEP)
         found.append(float(hand.tangential[0] / (MU * hand.normal[0])))
     return found
+
+
+@pytest.mark.parametrize("shear", range(SHEARS))
+def test_fuzzing_detects_every_shear_that_is_not_finite(shear):
+    hand = make()
+    assert is_sound(hand.plant.array[0])
+    hand.plant.state.extra_shear[shear] = math.nan
+    assert not is_sound(hand.plant.array[0])
 
 
 def test_creep_relaxes_a_stuck_shear_exponentially():

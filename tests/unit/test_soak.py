@@ -1,6 +1,7 @@
 """Test that short sequences meet all requirements, and that the soak test detects violations."""
 
 import math
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -78,6 +79,20 @@ def test_torque_after_a_stop_is_detected(soak):
         soak.run(3)
     with pytest.raises(AssertionError, match="a goal was sent"):
         soak.servos.write(Goal(valid=True))
+
+
+@pytest.mark.parametrize(
+    ("broken", "status"), [(virtual.CALM, 0), (virtual.OFF, 1), (virtual.STAYS, 1)]
+)
+def test_a_long_sequence_fails_if_torque_stays_on(monkeypatch, broken, status):
+    def run(_: int, ticks: int, account: Account) -> None:
+        account.sequences, account.held, account.ticks = 1, 1, ticks
+        account.judged.update(virtual.ASSERTIONS)
+        account.broken[broken] += 1
+
+    monkeypatch.setattr(virtual, "long_sequence", run)
+    monkeypatch.setattr(sys, "argv", ["virtual", "--ticks", str(virtual.LONG)])
+    assert virtual.main() == status
 
 
 def test_old_readings_and_frames_are_detected(soak):

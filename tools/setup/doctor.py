@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--save",
         type=Path,
         metavar="FILE",
-        help="store the servo registers in FILE before changing any of them",
+        help="store the servo registers in the new FILE before changing any of them",
     )
 
 

@@ -223,7 +223,7 @@ def send_words(folder: Path, text: str) -> str:
     Refused
         If the text is too long. The emulator would read only its beginning.
     """
-    message = text.encode()
+    message = text.encode(errors="replace")
     if len(message) > _MESSAGE_SIZE_MAX:
         problem = f"found {len(message)} bytes, expected at most {_MESSAGE_SIZE_MAX}"
         raise Refused(f"{problem}: send fewer words at a time", Reason.REQUEST)
