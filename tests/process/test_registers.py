@@ -190,6 +190,7 @@ def test_invalid_register_files_are_refused(bus, tmp_path):
             ServoError, match="expected a file written by `softfinger doctor --save`"
         ):
             restore_registers(settings, path)
+    path.unlink()
     save_registers(settings, path)
     other = path.read_text(encoding="utf-8").replace("XM430-W350", "XM430-W210", 1)
     path.write_text(other, encoding="utf-8")

@@ -250,7 +250,13 @@ def _listeners(rig: Rig, account: Account) -> Iterator[dict[str, int]]:
         "--split-time",
         str(_SPLIT),
     )
-    subscribe = (sys.executable, "-m", "tests.soak.hil", "--subscribe", rig.stream)
+    subscribe = (
+        sys.executable,
+        "-m",
+        "tests.soak.hil",
+        "--subscribe",
+        f"{rig.stream},{rig.commands}",
+    )
     with ExitStack() as running:
         recorder, *subscribers = [
             running.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
@@ -311,10 +317,14 @@ def _conclude(account: Account) -> None:
         account.wrong.append(f"numbers of states differ: {account.received}, {account.recorded}")
 
 
-def subscribe(address: str) -> None:
+def subscribe(addresses: str) -> None:
     """Print "ready" at the first state, and the counts of received and lost states at the end."""
     received = 0
-    with StopCondition() as ending, Hand(address, timeout=60.0) as hand, hand.stream(1.0) as states:
+    with (
+        StopCondition() as ending,
+        Hand(addresses, timeout=60.0) as hand,
+        hand.stream(1.0) as states,
+    ):
         ending.begin()
         while not ending.is_met:
             with suppress(NoStream):  # The daemon may have exited.
@@ -329,7 +339,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak.hil", description=__doc__)
     parser.add_argument("--seconds", type=float, default=SECONDS)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--subscribe", metavar="ADDRESS", help=argparse.SUPPRESS)
+    parser.add_argument("--subscribe", metavar="ADDRESSES", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.subscribe:
         subscribe(arguments.subscribe)
