@@ -112,9 +112,9 @@ class HistoryRow(Record):
 
     t: float
     d: Pair
-    # Standard deviations of a frame due to recent motion
-    pending_d: Pair  # [m]
-    pending_tilt: Pair  # [rad]
+    # Standard deviations of d [m] and of the tilt [rad] in a frame due to recent motion
+    pending_d: Pair
+    pending_tilt: Pair
     angle: float
     q: Pair
     relaxation: Pair
